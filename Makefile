@@ -8,7 +8,7 @@ DOCS_INSTALLED := .venv/.installed-docs
 
 VIEWER_PACKAGES := mesa-vulkan-drivers libvulkan1 chromium chromium-driver
 
-.PHONY: run docs docs-serve lint test test-integration test-oldest test-newest test-slow test-wheel test-gpu test-viewer test-docs viewer-packages check bench bench-gpu clean
+.PHONY: run docs docs-serve figures lint test test-integration test-oldest test-newest test-slow test-wheel test-gpu test-viewer test-docs viewer-packages check bench bench-gpu clean
 
 run: $(INSTALLED)
 	$(BIN)/python recipes/tragedy.py --watch serve --linger
@@ -17,10 +17,14 @@ run: $(INSTALLED)
 docs: $(DOCS_INSTALLED)
 	cd docs && ../$(BIN)/python -m website.build
 
+# The committed figures drawn anew, in one style; GROUPS="institutions governs" draws a part of them.
+figures: $(INSTALLED)
+	$(BIN)/python docs/draw_figures.py $(GROUPS)
+
 docs-serve: docs
 	$(BIN)/python -m http.server --bind 127.0.0.1 --directory build/site $(or $(PORT),8765)
 
-# ARGS="tests/test_ring.py" runs a part of the tests.
+# ARGS="tests/learners/test_ring.py" runs a part of the tests.
 PYTEST := python -m pytest -n auto --dist worksteal
 NOT_HERE := not slow and not gpu and not viewer and not network and not docs
 
@@ -39,10 +43,10 @@ MORE_TORCH := $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 test-oldest test-newest: test-%: .venv-%/.installed
 	.venv-$*/bin/$(PYTEST) -m "$(NOT_HERE)" $(ARGS)
 
-.venv-oldest/.installed: pyproject.toml tests/oldest.py
+.venv-oldest/.installed: pyproject.toml tests/support/oldest.py
 	$(PYTHON) -m venv .venv-oldest
 	.venv-oldest/bin/python -m pip install -q packaging
-	.venv-oldest/bin/python tests/oldest.py dev > .venv-oldest/constraints.txt
+	.venv-oldest/bin/python tests/support/oldest.py dev > .venv-oldest/constraints.txt
 	.venv-oldest/bin/python -m pip install -q $(MORE_TORCH) -c .venv-oldest/constraints.txt -e ".[dev]"
 	touch $@
 
@@ -60,11 +64,11 @@ test-docs: $(DOCS_INSTALLED) viewer-packages
 	$(BIN)/python -m pytest -m docs
 
 viewer-packages:
-	sh tests/install_viewers.sh $(VIEWER_PACKAGES)
+	sh tests/support/install_viewers.sh $(VIEWER_PACKAGES)
 
 # The wheel, in a bare environment outside the checkout; pip fetches what it needs.
 test-wheel: $(INSTALLED)
-	$(BIN)/python -m pytest -m network tests/test_wheel.py
+	$(BIN)/python -m pytest -m network tests/house/test_wheel.py
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

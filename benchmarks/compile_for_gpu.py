@@ -1,6 +1,7 @@
 """Compiles the rules for a GPU where there is none: to PTX by numba-cuda, and to machine code by ptxas.
 
-Proves that the kernels compile, not that they are right (`tests/test_cuda.py`) or fast (`gpu_steps.py`).
+Proves that the kernels compile, not that they are right (`tests/commons/test_cuda.py`) or fast
+(`gpu_steps.py`).
 
     .venv/bin/pip install -c constraints.txt -e ".[cuda12]"
     .venv/bin/python benchmarks/compile_for_gpu.py
@@ -28,7 +29,7 @@ from cprl.commons.cuda import kernels, to_run, to_show
 from cprl.commons.game import output_forms
 from cprl.commons.world import PLAY, Scratch, StepOutput, empty_scratch, empty_worlds
 from cprl.institutions import Tax
-from cprl.institutions.arrays import changed
+from cprl.institutions.arrays import map_arrays
 from cprl.institutions.law import new_law
 
 COMMONS: Final = presets.game("commons")
@@ -43,15 +44,15 @@ WORLDS: Final = 4
 
 
 def column_major(array: np.ndarray, is_of_worlds: bool) -> np.ndarray:
-    """The layout that `CudaThreads.place` gives an array."""
+    """Return an array in the layout that `CudaThreads.place` gives it."""
     return np.asfortranarray(array) if is_of_worlds else array
 
 
 def launches(game: Game) -> Iterator[tuple[str, Any, tuple[Any, ...]]]:
     """Yield each loop's name, its kernel, and arguments with the types and layouts that `CudaThreads` gives
     them."""
-    worlds = changed(empty_worlds(game, WORLDS), column_major)
-    law = changed(new_law(game, WORLDS), column_major) if game.institutions else None
+    worlds = map_arrays(empty_worlds(game, WORLDS), column_major)
+    law = map_arrays(new_law(game, WORLDS), column_major) if game.institutions else None
     output = StepOutput(*(np.zeros(*form) for form in output_forms(game, WORLDS).values()))
     arrays = empty_scratch(game)
     scratch = Scratch(*(np.zeros((WORLDS, *array.shape), array.dtype, order="F") for array in arrays))
@@ -65,7 +66,7 @@ def launches(game: Game) -> Iterator[tuple[str, Any, tuple[Any, ...]]]:
 
 
 def ptxas() -> Path | None:
-    """NVIDIA's assembler, as the extra `cuda12` brings it."""
+    """Return NVIDIA's assembler, as the extra `cuda12` brings it."""
     with suppress(PackageNotFoundError):
         for path in files("nvidia-cuda-nvcc-cu12") or ():
             if path.name == "ptxas":
@@ -86,7 +87,7 @@ def assembled(name: str, ptx: str, assembler: Path, capability: tuple[int, int])
 
 
 def main(*, capability: tuple[int, int] = (9, 0)) -> None:
-    """Prints a line for each kernel.
+    """Print a line for each kernel.
 
     Args:
         capability: of the GPU to compile for, (9, 0) for an H100 or H200.
@@ -95,7 +96,7 @@ def main(*, capability: tuple[int, int] = (9, 0)) -> None:
     dispatcher.get_current_device = lambda: gpu  # asks the driver otherwise, and there is none
     assembler = ptxas()
     asked = np.zeros((WORLDS, COMMONS.agents), np.int64), len(COMMONS.actions), np.zeros(1, np.int64)
-    every = [("find_unknown", kernels(()).find_unknown, asked)]
+    every = [("find_invalid", kernels(()).find_invalid, asked)]
     for game_name, game in GAMES.items():
         every += [(f"{game_name}: {loop}", *launch) for loop, *launch in launches(game)]
     for name, kernel, arguments in every:

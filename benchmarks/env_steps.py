@@ -44,12 +44,12 @@ class Rate:
 
     @property
     def steps_per_cpu_s(self) -> float:
-        """Environment steps per second of each core used."""
+        """Return environment steps per second of each core used."""
         return self.worlds / self.step_us * 1e6 / self.threads
 
 
 def best_us(step: Callable[[int], object], begin: Callable[[], object], turns: int, repeats: int) -> float:
-    """Microseconds of one step of all worlds, best of several repeats."""
+    """Return the microseconds of one step of all worlds, best of several repeats."""
     times = []
     for _ in range(repeats):
         begin()
@@ -62,20 +62,21 @@ def best_us(step: Callable[[int], object], begin: Callable[[], object], turns: i
 
 
 def actions_for(game: Game, worlds: int, turns: int) -> np.ndarray:
-    """int64 [turns, B, N], every action equally likely."""
+    """Return actions, int64 [turns, B, N], every one equally likely."""
     return np.random.default_rng(0).integers(0, len(game.actions), (turns, worlds, game.agents))
 
 
 def kernel(game: Game, worlds: int, threads: int, turns: int, repeats: int) -> Rate:
-    """The compiled rules alone, into the same arrays again and again."""
+    """Measure the compiled rules alone, into the same arrays again and again."""
     batch = Batch(game, worlds, threads=threads)
-    told, actions = batch.new_output(), actions_for(game, worlds, turns)
-    us = best_us(lambda turn: batch.play(actions[turn], told), lambda: batch.begin(told), turns, repeats)
+    output = batch.new_output()
+    actions = actions_for(game, worlds, turns)
+    us = best_us(lambda turn: batch.play(actions[turn], output), lambda: batch.begin(output), turns, repeats)
     return Rate(worlds, batch.driver.threads, us)
 
 
 def through_step(game: Game, worlds: int, threads: int, turns: int, repeats: int) -> Rate:
-    """`CommonsEnv.step`: fresh tensors and TensorDicts every turn."""
+    """Measure `CommonsEnv.step`: fresh tensors and TensorDicts every turn."""
     env = CommonsEnv(game, worlds, seed=0, threads=threads)
     actions = torch.as_tensor(actions_for(game, worlds, turns))
     moment = {"now": env.reset()}
@@ -92,7 +93,7 @@ def through_step(game: Game, worlds: int, threads: int, turns: int, repeats: int
 
 
 def main(*, worlds: tuple[int, ...] = (1, 16, 256, 1024, 4096), repeats: int = 7) -> None:
-    """Prints the table.
+    """Print the table.
 
     Args:
         worlds: the batch sizes to measure.

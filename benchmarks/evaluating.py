@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 
-def measured(checkout: Path, words: list[str]) -> tuple[float, float]:
+def measured(checkout: Path, arguments: list[str]) -> tuple[float, float]:
     """Return the seconds and the peak of the memory in MB of a command by the code of a checkout."""
     environment = {**os.environ, "PYTHONPATH": str(checkout.resolve() / "src")}
     code = (
@@ -26,7 +26,7 @@ def measured(checkout: Path, words: list[str]) -> tuple[float, float]:
     )
     began = time.perf_counter()
     done = subprocess.run(
-        [sys.executable, "-c", code, *words], env=environment, capture_output=True, text=True, check=True
+        [sys.executable, "-c", code, *arguments], env=environment, capture_output=True, text=True, check=True
     )
     return time.perf_counter() - began, float(done.stderr.split()[-1])
 
@@ -41,15 +41,16 @@ def main() -> None:
         "--words", nargs=argparse.REMAINDER, help="another command, last; by default evaluate RUN"
     )
     options = parser.parse_args()
-    words = options.words or ["evaluate", options.run]
+    arguments = options.words or ["evaluate", options.run]
     checkouts = {"before": options.before, "after": options.after}
     for checkout in checkouts.values():  # compile and fill the caches
-        measured(checkout, words)
+        measured(checkout, arguments)
     ratios = []
     for pair in range(options.pairs):
         names = list(checkouts) if pair % 2 == 0 else list(reversed(checkouts))
-        found = {name: measured(checkouts[name], words) for name in names}
-        (before_s, before_mb), (after_s, after_mb) = found["before"], found["after"]
+        costs = {name: measured(checkouts[name], arguments) for name in names}
+        before_s, before_mb = costs["before"]
+        after_s, after_mb = costs["after"]
         ratios.append((after_s / before_s, after_mb / before_mb))
         print(
             f"{before_s:6.2f} s -> {after_s:6.2f} s   {before_mb:6.0f} MB -> {after_mb:6.0f} MB   "
@@ -58,7 +59,7 @@ def main() -> None:
         )
     times, memory = zip(*ratios, strict=True)
     print(
-        f"{' '.join(words)}: median of {len(ratios)} pairs, after / before: "
+        f"{' '.join(arguments)}: median of {len(ratios)} pairs, after / before: "
         f"time {statistics.median(times):.3f}, memory {statistics.median(memory):.3f}"
     )
 

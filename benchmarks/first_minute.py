@@ -40,7 +40,7 @@ ADDRESS = re.compile(r"rerun\+http://127\.0\.0\.1:\d+/proxy")
 COMMAND = ("recipes/tragedy.py", "--watch", "serve", "--linger")
 LATER_S = (10.0, 60.0, 120.0)
 BOARD_PIXELS = 500
-"""Of apples, in a viewer's window of 640 x 400, on a board that is drawn; the plots have fewer."""
+"""The pixels of apples, in a viewer's window of 640 x 400, on a board that is drawn; the plots have fewer."""
 
 
 class Run:
@@ -86,7 +86,7 @@ class Run:
         Thread(target=self._look_at_the_board, daemon=True).start()
 
     def _look_at_the_board(self) -> None:
-        """Notes when a viewer shows apples."""
+        """Note when a viewer shows apples."""
         with native_viewer(connect_to=self.addresses, size=(640, 400)) as client:
             while self.board is None and self.process.poll() is None:
                 pixels = np.asarray(Image.open(BytesIO(client.take_screenshot())).convert("RGB"), np.int32)
@@ -94,7 +94,7 @@ class Run:
                     self.board = self.age_s
 
     def look(self) -> None:
-        """Notes which columns have come, as "/entity Component:field"."""
+        """Note which columns have come, as "/entity Component:field"."""
         for path in self.folder.glob("served-*.rrd"):
             with warnings.catch_warnings(), suppress(Exception):  # of the last chunk, half of it may be there
                 warnings.simplefilter("ignore")  # the file has no footer yet
@@ -118,7 +118,7 @@ class Run:
 
 
 def main(*, cold: bool = False, pictures: Path | None = None, size: tuple[int, int] = (1600, 1000)) -> None:
-    """Runs the command until it says that it is still served, and prints a table.
+    """Run the command until it says that it is still served, and print a table.
 
     Args:
         cold: whether the caches of compiled code are empty.
@@ -163,7 +163,7 @@ def wait(run: Run, is_there: Callable[[], bool]) -> None:
 
 
 def take_pictures(run: Run, folder: Path, size: tuple[int, int]) -> None:
-    """Pictures of the viewer at `LATER_S`, and when the run has ended."""
+    """Take pictures of the viewer at `LATER_S`, and when the run has ended."""
     folder.mkdir(parents=True, exist_ok=True)
     with native_viewer(connect_to=run.addresses, size=size) as client:
         for moment in LATER_S:

@@ -31,7 +31,7 @@ from cprl import presets
 from cprl.commons.batch import Batch
 from cprl.institutions import Quota
 batch = Batch({game}, 1)
-output = batch.begin(batch.new_output())
+output = batch.begin()
 batch.play(np.zeros((1, batch.game.agents), np.int64), output)
 batch.load(batch.state(), output)
 """

@@ -21,7 +21,7 @@ AIM = 50_000_000
 
 
 def seconds(step: Callable[[int], object], turns: int, repeats: int) -> float:
-    """Seconds of one step of all worlds, best of several repeats."""
+    """Return the seconds of one step of all worlds, best of several repeats."""
     step(0)
     best = float("inf")
     for _ in range(repeats):
@@ -35,19 +35,19 @@ def seconds(step: Callable[[int], object], turns: int, repeats: int) -> float:
 
 
 def rates(size: int, turns: int, repeats: int) -> tuple[float, float]:
-    """Environment steps per second of the kernel alone and of `CommonsEnv.step`, `size` worlds."""
+    """Return environment steps per second of the kernel alone and of `CommonsEnv.step`, `size` worlds."""
     env = CommonsEnv(presets.game("commons"), size, seed=0, device="cuda")
     actions = torch.randint(8, (turns, size, env.game.agents), device="cuda")
     arrays = [env.worlds.driver.wrap(turn) for turn in actions]  # type: ignore[attr-defined]
     moment = {"now": env.reset()}
-    told = env.output
+    output = env.output
 
     def step(turn: int) -> None:
         entry = moment["now"]
         entry.get(keys.AGENTS).set("action", actions[turn])
         moment["now"] = env.step(entry).get("next")
 
-    kernel_s = seconds(lambda turn: env.worlds.play(arrays[turn], told), turns, repeats)
+    kernel_s = seconds(lambda turn: env.worlds.play(arrays[turn], output), turns, repeats)
     moment["now"] = env.reset()
     return size / kernel_s, size / seconds(step, turns, repeats)
 
@@ -55,7 +55,7 @@ def rates(size: int, turns: int, repeats: int) -> tuple[float, float]:
 def main(
     *, worlds: tuple[int, ...] = (1024, 4096, 16_384, 65_536, 262_144), turns: int = 50, repeats: int = 5
 ) -> None:
-    """Prints the table.
+    """Print the table.
 
     Args:
         worlds: the batch sizes to measure.

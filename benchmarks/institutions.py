@@ -10,6 +10,7 @@ its best of many short rounds: others who use the machine disturb most rounds, a
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain
 from typing import Final
 
 import torch
@@ -62,17 +63,18 @@ EACH: Final[dict[str, tuple[Institution, ...]]] = {
 """Each kind, as cheap and as dear as it gets."""
 
 
-def of_kernel(game: Game, worlds: int, turns: int) -> Callable[[], float]:
-    """What measures the microseconds of a turn of the compiled rules alone."""
+def kernel_timer(game: Game, worlds: int, turns: int) -> Callable[[], float]:
+    """Return what measures the microseconds of a turn of the compiled rules alone."""
     batch = Batch(game, worlds, threads=1)
-    output, actions = batch.new_output(), actions_for(game, worlds, turns)
+    output = batch.new_output()
+    actions = actions_for(game, worlds, turns)
     return lambda: best_us(
         lambda turn: batch.play(actions[turn], output), lambda: batch.begin(output), turns, 1
     )
 
 
-def of_step(game: Game, worlds: int, turns: int) -> Callable[[], float]:
-    """What measures the microseconds of a turn through `CommonsEnv.step`."""
+def step_timer(game: Game, worlds: int, turns: int) -> Callable[[], float]:
+    """Return what measures the microseconds of a turn through `CommonsEnv.step`."""
     env = CommonsEnv(game, worlds, seed=0, threads=1)
     actions = torch.as_tensor(actions_for(game, worlds, turns))
     decisions = torch.zeros((worlds, game.agents), dtype=torch.int64)
@@ -92,7 +94,7 @@ def of_step(game: Game, worlds: int, turns: int) -> Callable[[], float]:
 
 
 def main(*, worlds: int = 1024, turns: int = 4, rounds: int = 200) -> None:
-    """Prints the table; ends with exit code 1 where an institution costs more than is allowed.
+    """Print the table; end with exit code 1 where an institution costs more than is allowed.
 
     Args:
         worlds: the batch size.
@@ -100,10 +102,10 @@ def main(*, worlds: int = 1024, turns: int = 4, rounds: int = 200) -> None:
         rounds: of which the best counts.
     """
     plain = presets.game("commons")
-    every = tuple(institution for of_kind in EACH.values() for institution in of_kind)
-    games = {"none": plain, **{name: replace(plain, institutions=of_kind) for name, of_kind in EACH.items()}}
+    every = tuple(chain.from_iterable(EACH.values()))
+    games = {"none": plain, **{name: replace(plain, institutions=kind) for name, kind in EACH.items()}}
     games["all at once"] = replace(plain, institutions=every)
-    ways = {"kernel": of_kernel, "CommonsEnv.step": of_step}
+    ways = {"kernel": kernel_timer, "CommonsEnv.step": step_timer}
     measures = {
         (name, way): measure(game, worlds, turns)
         for name, game in games.items()

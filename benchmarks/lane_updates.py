@@ -26,7 +26,10 @@ from cprl.learners.ring import Ring
 from cprl.learners.transitions import TransitionForm
 from cprl.networks.mlp import MLPNetwork
 
-SHAPE, ACTIONS, BATCH, TRANSITIONS = (3, 7, 15), 8, 8, 4096
+SHAPE = (3, 7, 15)
+ACTIONS = 8
+BATCH = 8
+TRANSITIONS = 4096
 
 WAYS: dict[str, Callable[..., LaneNetworks]] = {
     "a list": partial(LaneNetworks, update="list"),
@@ -44,8 +47,9 @@ LANES = (1, 4, 16, 64)
 
 
 def filled(lanes: int) -> Ring:
-    """A full buffer of noise."""
-    form, seeds = TransitionForm(observation_shape=SHAPE), [(0, lane) for lane in range(lanes)]
+    """Return a full buffer of noise."""
+    form = TransitionForm(observation_shape=SHAPE)
+    seeds = [(0, lane) for lane in range(lanes)]
     ring = Ring(form, seeds=seeds, transitions=TRANSITIONS, batch_size=BATCH)
     kept = ring.state_dict()
     state = kept["storage"]
@@ -61,7 +65,7 @@ def filled(lanes: int) -> Ring:
 
 
 def update_us(way: str, lanes: int, repeats: int) -> float:
-    """Microseconds of one update of all lanes, the best of several repeats."""
+    """Return the microseconds of one update of all lanes, the best of several repeats."""
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     torch.manual_seed(0)
@@ -69,11 +73,13 @@ def update_us(way: str, lanes: int, repeats: int) -> float:
     together = WAYS[way](
         networks, DQN(settings=DQNSettings(gamma=0.995)).make_loss, UpdateRule(learning_rate=1e-5)
     )
-    buffer, best = filled(lanes), float("inf")
+    buffer = filled(lanes)
+    best = float("inf")
     for _ in range(20):
         together.learn(buffer.draw())
     for _ in range(repeats):
-        turns, started = 0, time.perf_counter()
+        turns = 0
+        started = time.perf_counter()
         while time.perf_counter() - started < 0.3:
             together.learn(buffer.draw())
             turns += 1
@@ -82,7 +88,7 @@ def update_us(way: str, lanes: int, repeats: int) -> float:
 
 
 def add_rows(table: Table, rows: dict[str, Sequence[float]]) -> None:
-    """A row for each way: microseconds and, in brackets, how many times as fast as the list."""
+    """Add a row for each way: microseconds and, in brackets, how many times as fast as the list."""
     reference = rows["a list"]
     for name, row in rows.items():
         cells = (f"{us:,.0f} ({base / us:.0f}x)" for us, base in zip(row, reference, strict=True))
@@ -90,7 +96,7 @@ def add_rows(table: Table, rows: dict[str, Sequence[float]]) -> None:
 
 
 def main(*, lanes: tuple[int, ...] = LANES, repeats: int = 5) -> None:
-    """Prints the table.
+    """Print the table.
 
     Args:
         lanes: how many agents learn at once.

@@ -46,7 +46,8 @@ from c51 import C51
 from cql import CQL
 from iql import IQL
 
-REPLAY, ROLLOUTS = DQNSettings(buffer_size=1000), RolloutSettings()
+REPLAY = DQNSettings(buffer_size=1000)
+ROLLOUTS = RolloutSettings()
 ALGORITHMS = {
     "DQN": DQN(settings=REPLAY),
     "double DQN": DQN(settings=REPLAY, double=True),
@@ -69,39 +70,41 @@ BATCH = 8
 
 
 def learner_of(algorithm: Algorithm, learners: int) -> Learner:
-    """So many learners, four in each replica of `commons`, as lanes or teams."""
+    """Return so many learners, four in each replica of `commons`, as lanes or teams."""
     game = presets.game("commons")
     reward = "team" if isinstance(algorithm, TeamAlgorithm) else "individual"
     lanes = Lanes(game.spaces, agents=range(game.agents), replicas=learners // game.agents, reward=reward)
-    made = algorithm.make_learner(lanes, "compiled")
-    assert isinstance(made, Learner)
-    return made
+    learner = algorithm.make_learner(lanes, "compiled")
+    assert isinstance(learner, Learner)
+    return learner
 
 
 def update_us(name: str, learners: int, repeats: int) -> tuple[str, bool, float]:
-    """The `update`, whether it is compiled, and microseconds of one of so many learners."""
+    """Return the `update`, whether it is compiled, and microseconds of one of so many learners."""
     torch.set_num_threads(1)
     torch.set_flush_denormal(True)
     torch.manual_seed(0)
-    learner, best = learner_of(ALGORITHMS[name], learners), float("inf")
+    learner = learner_of(ALGORITHMS[name], learners)
+    best = float("inf")
     networks = learner.lane_networks
     draw = Draw.of(learner.memory.example(len(learner.lanes))[:, :BATCH].contiguous())
-    with warnings.catch_warnings(record=True) as told:
+    with warnings.catch_warnings(record=True) as raised:
         warnings.simplefilter("always")
         for _ in range(10):
             networks.learn(draw)
     for _ in range(repeats):
-        turns, started = 0, time.perf_counter()
+        turns = 0
+        started = time.perf_counter()
         while time.perf_counter() - started < 0.3:
             networks.learn(draw)
             turns += 1
         best = min(best, (time.perf_counter() - started) / turns)
-    failed = any("torch.compile failed" in str(one.message) for one in told)
+    failed = any("torch.compile failed" in str(one.message) for one in raised)
     return networks.update, networks.update != "list" and not failed, best * 1e6
 
 
 def main(*, learners: tuple[int, ...] = (4, 32), repeats: int = 5, only: tuple[str, ...] = ()) -> None:
-    """Prints the table.
+    """Print the table.
 
     Args:
         learners: how many agents learn at once, multiples of four.
@@ -119,8 +122,8 @@ def main(*, learners: tuple[int, ...] = (4, 32), repeats: int = 5, only: tuple[s
         for name in only or ALGORITHMS:
             measured = [process.submit(update_us, name, count, repeats).result() for count in learners]
             update, compiled, _ = measured[0]
-            cells = (f"{us:,.0f}" for _, _, us in measured)
-            table.add_row(name, update, "yes" if compiled else "no", *cells)
+            is_compiled = "yes" if compiled else "no"
+            table.add_row(name, update, is_compiled, *(f"{us:,.0f}" for _, _, us in measured))
     Console().print(table)
 
 

@@ -29,14 +29,17 @@ from torch import nn
 
 from cprl import CommonsEnv, presets
 from cprl.algorithms import DQN, MADDPG, MAPPO, PPO, QMIX, VDN, DQNSettings, RolloutSettings
-from cprl.policies.assignment import AgentPolicies
+from cprl.policies.joint_policy import JointPolicy
 from cprl.population import AgentSpec, Learning, Team
 from cprl.runs.schedule import Schedule
 from cprl.system.process import prepare_process
 from cprl.training.agents import Population
 from cprl.training.training import Training
 
-AGENTS, TURNS, PLAIN_WORLDS, MINIBATCH = 4, 64, 256, 2048
+AGENTS = 4
+TURNS = 64
+PLAIN_WORLDS = 256
+MINIBATCH = 2048
 EVERYONE: Final = tuple(range(AGENTS))
 GAME: Final = presets.game("commons", variant="as_run")
 
@@ -80,17 +83,17 @@ of 512, as many transitions; "dqn-64" one of 64."""
 
 PARTS: Final[dict[str, tuple[type, str]]] = {
     "game": (CommonsEnv, "_step_and_maybe_reset"),
-    "acting": (AgentPolicies, "forward"),
+    "acting": (JointPolicy, "forward"),
 }
 
 
 def timed(owner: Any, name: str, part: str, spent: Counter[str]) -> AbstractContextManager[Any]:
-    """While it is open the processor time of a method is added up, in seconds."""
+    """Return a context in which the processor time of a method is added up, in seconds."""
     plain: Callable[..., Any] = getattr(owner, name)
 
-    def with_clock(*arguments: Any, **named: Any) -> Any:
+    def with_clock(*arguments: Any, **options: Any) -> Any:
         started = time.process_time()
-        result = plain(*arguments, **named)
+        result = plain(*arguments, **options)
         spent[part] += time.process_time() - started  # type: ignore[assignment]
         return result
 
@@ -105,7 +108,8 @@ class Plain:
         self.env = CommonsEnv(GAME, PLAIN_WORLDS, seed=0)
         self.now = self.env.reset()
         self.inputs = torch.Size(GAME.observation_shape).numel()
-        self.actor, self.critic = self._network(GAME.spaces.actions), self._network(1)
+        self.actor = self._network(GAME.spaces.actions)
+        self.critic = self._network(1)
         self.adam = torch.optim.Adam([*self.actor, *self.critic], lr=3e-4, fused=True)
         self.loss = torch.compile(self._loss)
 
@@ -128,39 +132,42 @@ class Plain:
         gain: torch.Tensor,
         target: torch.Tensor,
     ) -> torch.Tensor:
-        chances = self._outputs(self.actor, seen).log_softmax(-1)
-        ratio = (chances.gather(-1, action.unsqueeze(-1)).squeeze(-1) - before).exp()
-        entropy = -(chances.exp() * chances).sum(-1).mean()
+        log_probs = self._outputs(self.actor, seen).log_softmax(-1)
+        ratio = (log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1) - before).exp()
+        entropy = -(log_probs.exp() * log_probs).sum(-1).mean()
         error = (self._outputs(self.critic, seen).squeeze(-1) - target).square().mean()
         gained = torch.min(ratio * gain, ratio.clamp(0.8, 1.2) * gain).mean()
         return 0.5 * error - gained - 0.01 * entropy
 
     def rollout(self) -> None:
-        """One rollout and four epochs over it."""
+        """Play one rollout, and learn four epochs over it."""
         columns: dict[str, list[torch.Tensor]] = {
-            name: [] for name in ("seen", "action", "chance", "reward", "done")
+            name: [] for name in ("seen", "action", "log_prob", "reward", "done")
         }
         with torch.no_grad():
             for _ in range(TURNS):
                 seen = self._by_agent(self.now["agents", "observation"])
-                chances = self._outputs(self.actor, seen).log_softmax(-1)
-                action = (chances - torch.empty_like(chances).exponential_().log()).argmax(-1)
+                log_probs = self._outputs(self.actor, seen).log_softmax(-1)
+                action = (log_probs - torch.empty_like(log_probs).exponential_().log()).argmax(-1)
                 self.now["agents", "action"] = action.t().contiguous()
                 turn, self.now = self.env.step_and_maybe_reset(self.now)
-                chance = chances.gather(-1, action.unsqueeze(-1)).squeeze(-1)
+                log_prob = log_probs.gather(-1, action.unsqueeze(-1)).squeeze(-1)
                 reward = turn["next", "agents", "reward"].squeeze(-1).t()
                 done = turn["next", "done"].squeeze(-1)
-                for column, value in zip(columns.values(), (seen, action, chance, reward, done), strict=True):
+                for column, value in zip(
+                    columns.values(), (seen, action, log_prob, reward, done), strict=True
+                ):
                     column.append(value)
             last = self._by_agent(self.now["agents", "observation"])
             values = [self._outputs(self.critic, seen).squeeze(-1) for seen in (*columns["seen"], last)]
-            gains, gain = [], torch.zeros(AGENTS, PLAIN_WORLDS)
+            gains = []
+            gain = torch.zeros(AGENTS, PLAIN_WORLDS)
             for turn in reversed(range(TURNS)):
                 goes_on = ~columns["done"][turn]
                 error = columns["reward"][turn] + 0.99 * values[turn + 1] * goes_on - values[turn]
                 gain = error + 0.99 * 0.95 * goes_on * gain
                 gains.append(gain)
-        batch = [torch.stack(columns[name], 1).flatten(1, 2) for name in ("seen", "action", "chance")]
+        batch = [torch.stack(columns[name], 1).flatten(1, 2) for name in ("seen", "action", "log_prob")]
         advantage = torch.stack(gains[::-1], 1).flatten(1, 2)
         batch += [advantage, advantage + torch.stack(values[:-1], 1).flatten(1, 2)]
         for _ in range(4):
@@ -180,8 +187,8 @@ class Plain:
 
 
 def products_s(case: Case) -> float:
-    """Processor seconds of the matrix products alone of a turn of all worlds of a case of independent agents:
-    those of acting, of evaluating rollouts or targets, and of updates forwards and backwards."""
+    """Return the processor seconds of the matrix products alone of a turn of all worlds of a case of
+    independent agents: of acting, evaluating rollouts or targets, and updates forwards and backwards."""
     settings = case.agents[0].algorithm.settings  # type: ignore[union-attr]
     inputs = torch.Size(GAME.observation_shape).numel()
 
@@ -191,14 +198,15 @@ def products_s(case: Case) -> float:
 
         def once() -> None:
             for place, (values, weight) in enumerate(pairs):
-                given = torch.bmm(values, weight)
+                product = torch.bmm(values, weight)
                 if back:
-                    torch.bmm(values.transpose(1, 2), given)
+                    torch.bmm(values.transpose(1, 2), product)
                     if place:
-                        torch.bmm(given, weight.transpose(1, 2))
+                        torch.bmm(product, weight.transpose(1, 2))
 
         once()
-        started, count = time.process_time(), 0
+        started = time.process_time()
+        count = 0
         while time.process_time() - started < 0.3:
             once()
             count += 1
@@ -219,9 +227,10 @@ def products_s(case: Case) -> float:
 
 
 def measure(name: str, rounds: int) -> dict[str, float]:
-    """The rate of a case, beside the plain loop's, its memory in MiB, and the shares of its time."""
+    """Return the rate of a case, beside the plain loop's, its memory in MiB, and the shares of its time."""
     prepare_process(0)
-    case, plain = CASES[name], Plain()
+    case = CASES[name]
+    plain = Plain()
     env = CommonsEnv(GAME, case.worlds, seed=0)
     population = Population(env, case.agents, seed=0, worlds=case.worlds)
     training = Training(env, population.learners, Schedule(steps=2**60, worlds=case.worlds))
@@ -231,13 +240,14 @@ def measure(name: str, rounds: int) -> dict[str, float]:
         training.step()
     results: dict[str, list[float]] = {}
     for _ in range(rounds):
-        before, spent = plain.rate(), Counter[str]()
+        before = plain.rate()
+        spent = Counter[str]()
         started = time.process_time()
         for _ in range(case.turns):
             training.step()
         seconds = time.process_time() - started
         rate = case.turns * case.worlds / seconds
-        found = {"env steps/s": rate, "beside": 2 * rate / (before + plain.rate()), "plain": before}
+        numbers = {"env steps/s": rate, "beside": 2 * rate / (before + plain.rate()), "plain": before}
         clocks = [timed(owner, method, part, spent) for part, (owner, method) in PARTS.items()]
         clocks.append(timed(learner, "update", "learning", spent))
         for clock in clocks:
@@ -248,31 +258,33 @@ def measure(name: str, rounds: int) -> dict[str, float]:
         seconds = time.process_time() - started
         for clock in clocks:
             clock.__exit__(None, None, None)
-        found |= {part: spent[part] / seconds for part in (*PARTS, "learning")}
-        found["products"] = products_s(case) * rate / case.worlds if len(case.agents) > 1 else float("nan")
-        for what, value in found.items():
+        numbers |= {part: spent[part] / seconds for part in (*PARTS, "learning")}
+        numbers["products"] = products_s(case) * rate / case.worlds if len(case.agents) > 1 else float("nan")
+        for what, value in numbers.items():
             results.setdefault(what, []).append(value)
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     return {**{what: median(values) for what, values in results.items()}, "memory": memory}
 
 
 def main(cases: tuple[str, ...] = tuple(CASES), rounds: int = 3) -> None:
-    """Args:
-    cases: which, by name.
-    rounds: of each.
+    """Print the table.
+
+    Args:
+        cases: which, by name.
+        rounds: of each.
     """
     heads = ("case", "worlds", "env steps/s", "agent steps/s", "beside plain")
     table = Table(*heads, "game", "acting", "learning", "products", "peak MiB")
     plain = []
     for name in cases:
         with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
-            found = pool.submit(measure, name, rounds).result()
-        rate = found["env steps/s"]
-        shares = [f"{found[part]:.0%}" for part in (*PARTS, "learning")]
-        products = "" if found["products"] != found["products"] else f"{found['products']:.0%}"
+            numbers = pool.submit(measure, name, rounds).result()
+        rate = numbers["env steps/s"]
+        shares = [f"{numbers[part]:.0%}" for part in (*PARTS, "learning")]
+        products = "" if numbers["products"] != numbers["products"] else f"{numbers['products']:.0%}"
         table.add_row(name, str(CASES[name].worlds), f"{rate:,.0f}", f"{AGENTS * rate:,.0f}",
-                      f"{found['beside']:.2f}", *shares, products, f"{found['memory']:,.0f}")  # fmt: skip
-        plain.append(found["plain"])
+                      f"{numbers['beside']:.2f}", *shares, products, f"{numbers['memory']:,.0f}")  # fmt: skip
+        plain.append(numbers["plain"])
     console = Console(width=120)
     console.print(table)
     console.print(f"plain loop: {median(plain):,.0f} env steps/s")

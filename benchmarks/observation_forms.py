@@ -32,13 +32,13 @@ FORMS = {
 
 
 def games() -> dict[str, Game]:
-    """The commons board under every form."""
+    """Return the commons board under every form."""
     game = presets.game("commons")
     return {name: replace(game, observation=form) for name, form in FORMS.items()}
 
 
 def main(*, worlds: int = 1024, turns: int = 100, rounds: int = 5) -> None:
-    """Prints the table.
+    """Print the table.
 
     Args:
         worlds: the batch size.
@@ -62,7 +62,8 @@ def main(*, worlds: int = 1024, turns: int = 100, rounds: int = 5) -> None:
     for form, game in games().items():
         row = [form, " x ".join(map(str, game.observation_shape))]
         for engine in ways:
-            rate, plain = best[form, engine], best["window, rgb", engine]
+            rate = best[form, engine]
+            plain = best["window, rgb", engine]
             row += [f"{rate.steps_per_cpu_s:,.0f}", f"{plain.step_us / rate.step_us:.2f}"]
         table.add_row(*row)
     Console().print(table)

@@ -31,7 +31,7 @@ from torchrl_ippo import ENDS, LOG_PROB, LOGITS, VALUE, OwnMLPs
 
 
 def tutorial(rollouts: int) -> float:
-    """The median rate of TorchRL's parts, after a first rollout."""
+    """Return the median rate of TorchRL's parts, after a first rollout."""
     env = CommonsEnv(GAME, PLAIN_WORLDS, seed=0)
     sizes = {"n_agents": AGENTS, "centralized": False, "share_params": False, "num_cells": [32, 32]}
     outputs = GAME.spaces.actions, 1
@@ -42,13 +42,15 @@ def tutorial(rollouts: int) -> float:
     loss = ClipPPOLoss(actor, value, entropy_coeff=0.01)
     loss.set_keys(action=keys.ACTION, sample_log_prob=LOG_PROB, value=VALUE, reward=keys.REWARD, **ENDS)
     loss.make_value_estimator(ValueEstimators.GAE, gamma=0.99, lmbda=0.95)
-    adam, frames = torch.optim.Adam(loss.parameters(), lr=3e-4, fused=True), PLAIN_WORLDS * TURNS
+    adam = torch.optim.Adam(loss.parameters(), lr=3e-4, fused=True)
+    frames = PLAIN_WORLDS * TURNS
     sizes = {"frames_per_batch": frames, "total_frames": (1 + rollouts) * frames}
-    rates, began = [], time.process_time()
+    rates = []
+    began = time.process_time()
     for batch in Collector(env, actor, **sizes, auto_register_policy_transforms=False):
         later = batch["next"]
-        for of_world, of_agents in ENDS.items():
-            later[of_agents] = later[of_world].unsqueeze(-2).expand(later[keys.REWARD].shape)
+        for end, key in ENDS.items():
+            later[key] = later[end].unsqueeze(-2).expand(later[keys.REWARD].shape)
         with torch.no_grad():
             loss.value_estimator(batch, params=loss.critic_network_params)
         flat = batch.reshape(-1)
@@ -63,8 +65,10 @@ def tutorial(rollouts: int) -> float:
 
 
 def main(rollouts: int = 3) -> None:
-    """Args:
-    rollouts: of the tutorial, after the first.
+    """Print the rates.
+
+    Args:
+        rollouts: of the tutorial, after the first.
     """
     prepare_process(0)
     plain = Plain()

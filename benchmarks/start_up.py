@@ -12,7 +12,7 @@ from typing import Final
 import tyro
 
 MOST_S: Final = 0.3
-"""What is allowed where the answer needs nothing of a run."""
+"""The seconds that are allowed where the answer needs nothing of a run."""
 AT_ONCE: Final = (
     *(("-m", "cprl", "--version"), ("-m", "cprl", "--help"), ("-m", "cprl", "recipe")),
     *(("-m", "cprl", "run", "comons"), ("-m", "cprl", "run", "commons", "--epsiodes", "3")),
@@ -26,27 +26,27 @@ OTHERS: Final = (
 """The flags of a recipe are made of its experiment, which needs torch."""
 
 
-def median_s(words: tuple[str, ...], times: int) -> float:
-    """The processor time of `python WORDS`, in seconds."""
+def median_s(arguments: tuple[str, ...], times: int) -> float:
+    """Return the processor time of `python ARGUMENTS`, in seconds."""
     seconds = []
     for _ in range(times):
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        run([sys.executable, *words], stdout=DEVNULL, stderr=DEVNULL)
+        run([sys.executable, *arguments], stdout=DEVNULL, stderr=DEVNULL)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         seconds.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
     return median(seconds)
 
 
 def main(times: int = 9) -> None:
-    """Prints the time of each, and ends with exit code 1 where an answer takes longer than is allowed.
+    """Print the time of each, and end with exit code 1 where an answer takes longer than is allowed.
 
     Args:
         times: processes of each.
     """
-    seconds = {words: median_s(words, times) for words in (*AT_ONCE, *OTHERS)}
-    for words, value in seconds.items():
-        print(f"{value:6.2f} s  python {' '.join(words)}")
-    sys.exit(int(max(seconds[words] for words in AT_ONCE) > MOST_S))
+    seconds = {command: median_s(command, times) for command in (*AT_ONCE, *OTHERS)}
+    for command, value in seconds.items():
+        print(f"{value:6.2f} s  python {' '.join(command)}")
+    sys.exit(int(max(seconds[command] for command in AT_ONCE) > MOST_S))
 
 
 if __name__ == "__main__":

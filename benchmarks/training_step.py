@@ -16,6 +16,7 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import AbstractContextManager
 from dataclasses import replace
 from multiprocessing import get_context
+from operator import itemgetter
 from statistics import median
 from typing import Any, Final
 from unittest.mock import patch
@@ -29,8 +30,8 @@ from cprl.algorithms import DQN
 from cprl.algorithms.base import TrainingEngine
 from cprl.learners.lanes import Lanes
 from cprl.learners.learner import Learner
-from cprl.measuring.episodes import EpisodeTracker
-from cprl.policies.assignment import AgentPolicies
+from cprl.measuring.tracker import EpisodeTracker
+from cprl.policies.joint_policy import JointPolicy
 from cprl.system.process import prepare_process
 from cprl.training import Schedule, Training
 
@@ -41,7 +42,7 @@ CASES: Final[tuple[tuple[presets.Board, int, int], ...]] = (
 )
 """Board, agents, replicas."""
 PARTS: Final[dict[str, tuple[type, str]]] = {
-    "policy": (AgentPolicies, "forward"),
+    "policy": (JointPolicy, "forward"),
     "environment": (CommonsEnv, "_step_and_maybe_reset"),
     "replay write": (Learner, "store"),
     "update": (Learner, "update"),
@@ -51,13 +52,13 @@ STEPS: Final = 200
 
 
 def timed(part: str, spent: Counter[str]) -> AbstractContextManager[Any]:
-    """While it is open the time that a part takes is added up, in seconds."""
+    """Return a context in which the time that a part takes is added up, in seconds."""
     owner, name = PARTS[part]
     plain: Callable[..., Any] = getattr(owner, name)
 
-    def with_clock(*arguments: Any, **named: Any) -> Any:
+    def with_clock(*arguments: Any, **options: Any) -> Any:
         started = time.perf_counter()
-        result = plain(*arguments, **named)
+        result = plain(*arguments, **options)
         spent[part] += time.perf_counter() - started  # type: ignore[assignment]
         return result
 
@@ -65,7 +66,7 @@ def timed(part: str, spent: Counter[str]) -> AbstractContextManager[Any]:
 
 
 def seconds(step: Callable[[], object]) -> float:
-    """Of STEPS steps."""
+    """Return the seconds of `STEPS` steps."""
     started = time.perf_counter()
     for _ in range(STEPS):
         step()
@@ -75,7 +76,8 @@ def seconds(step: Callable[[], object]) -> float:
 def measure(
     board: presets.Board, agents: int, replicas: int, repeats: int, engine: TrainingEngine
 ) -> dict[str, float]:
-    """Microseconds of each part, of a whole step, and of an update alone; and the ratio of the last two."""
+    """Return the microseconds of each part, of a whole step, and of an update alone, and the ratio of the
+    last two."""
     prepare_process(0)
     game = presets.game(board)
     settings = replace(presets.dqn_settings(board), buffer_size=20_000)
@@ -92,7 +94,8 @@ def measure(
 
     ratios = []
     for _ in range(repeats):
-        whole, alone = seconds(training.step), seconds(learner.update)
+        whole = seconds(training.step)
+        alone = seconds(learner.update)
         keep("whole step", whole)
         keep("update alone", alone)
         ratios.append(whole / alone)
@@ -107,7 +110,7 @@ def measure(
 
 
 def main(*, repeats: int = 15, engine: TrainingEngine = "compiled") -> None:
-    """Prints the table.
+    """Print the table.
 
     Args:
         repeats: of which the best counts.
@@ -123,7 +126,7 @@ def main(*, repeats: int = 15, engine: TrainingEngine = "compiled") -> None:
         table.add_row(
             part, *(f"{best[part]:,.0f} ({best[part] / best['whole step']:.0%})" for best in columns)
         )
-    rest = [best["whole step"] - sum(best[part] for part in PARTS) for best in columns]
+    rest = [best["whole step"] - sum(itemgetter(*PARTS)(best)) for best in columns]
     table.add_row("the rest", *(f"{us:,.0f}" for us in rest))
     table.add_section()
     table.add_row("whole step", *(f"{best['whole step']:,.0f}" for best in columns))

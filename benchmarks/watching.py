@@ -31,11 +31,12 @@ from tensordict import TensorDict, TensorDictBase
 
 from cprl import CommonsEnv, presets
 from cprl.algorithms import DQN
+from cprl.experimental.current_policy import CurrentPolicy
+from cprl.experimental.exhibition import EXHIBITED_WORLD, Exhibition
 from cprl.learners.lanes import Lanes
 from cprl.measuring import Episode
 from cprl.measuring.series import Observer
-from cprl.policies.lanes import random_agents
-from cprl.policies.present import PresentPolicy
+from cprl.policies.actors import random_agents
 from cprl.system.process import prepare_process
 from cprl.training import Schedule, Training
 from cprl.viewer.callback import ViewerCallback
@@ -47,42 +48,45 @@ BLOCK: Final = 50
 """Turns; the tenth and the twentieth pair of blocks end with an episode."""
 EPISODE_S: Final = 1.8
 FLUSHED_EVERY: Final = round(60 / EPISODE_S)
-MOST_TIME, MOST_BYTES = 0.02, 100e6
-"""What is allowed."""
+MOST_TIME: Final = 0.02
+MOST_BYTES: Final = 100e6
+"""The share of time and the size of a file that are allowed."""
 
 
 @dataclass
 class Cost:
-    """How many times as long an episode takes when it is watched."""
+    """The time of an episode that is watched, as a multiple of one that is not."""
 
-    shown: float
+    drawn: float
     """With frames in the file."""
     others: float
     """Without."""
     live: float
     """Without, but served, with the exhibition."""
     every: int
-    """Of how many episodes one has its frames kept."""
+    """The number of episodes of which one has its frames kept."""
     steps_per_s: float
-    """Of the exhibition, in a second of the time that was watched."""
+    """The steps of the exhibition in a second of the time that was watched."""
 
     def share(self, others: float) -> float:
-        """What is added to the time of a training."""
-        return (self.shown + (self.every - 1) * others) / self.every - 1
+        """Return what is added to the time of a training."""
+        return (self.drawn + (self.every - 1) * others) / self.every - 1
 
 
 class Watched:
     """A clock of the time that is watched, seconds."""
 
     def __init__(self) -> None:
-        self.spent, self.began = 0.0, None
+        self.spent = 0.0
+        self.began = None
 
     def __call__(self) -> float:
-        return self.spent + (0.0 if self.began is None else time.perf_counter() - self.began)
+        since = 0.0 if self.began is None else time.perf_counter() - self.began
+        return self.spent + since
 
 
 def cost(run: Path, repeats: int) -> Cost:
-    """Measures an episode's time, watched and not."""
+    """Measure an episode's time, watched and not."""
     prepare_process(0)
     game = presets.game("commons")
     settings = replace(presets.dqn_settings("commons"), buffer_size=20_000)
@@ -94,69 +98,81 @@ def cost(run: Path, repeats: int) -> Cost:
     clock = Watched()
 
     def seconds(watch: ViewerCallback | None) -> float:
-        training.observer = Observer([watch] if watch else [], env)
+        callbacks = [watch] if watch else []
+        training.observer = Observer(callbacks, env)
         started = time.perf_counter()
         clock.began = started if watch else None
         for _ in range(BLOCK):
             training.step()
         spent = time.perf_counter() - started
         if watch:
-            clock.spent, clock.began = clock.spent + spent, None
+            clock.spent += spent
+            clock.began = None
         return spent
 
     def ratio(watch: ViewerCallback) -> float:
-        """Episodes end in blocks that are watched and in others in turn: their end takes time anyway."""
+        """Return how many times as long blocks take that are watched.
+
+        Episodes end in blocks that are watched and in others in turn: their end takes time anyway.
+        """
         ratios = []
         for _ in range(repeats):
             spent = {True: 0.0, False: 0.0}
             for ends_watched in (True, False):
                 for pair in range(steps // BLOCK):
                     for watched in (False, True) if pair % 2 == ends_watched else (True, False):
-                        spent[watched] += seconds(watch if watched else None)
+                        watching = watch if watched else None
+                        spent[watched] += seconds(watching)
             ratios.append(spent[True] / spent[False])
         return median(ratios)
 
     for _ in range(steps // BLOCK):
         seconds(None)
     with ViewerCallback(run, env, title="cost", episodes=EPISODES) as watch:
-        every, watch.filming.every = watch.filming.every, 1
-        shown = ratio(watch)
-        watch.filming.every = 10**9
+        every = watch.schedule.every
+        watch.schedule.every = 1
+        drawn = ratio(watch)
+        watch.schedule.every = 10**9
         others = ratio(watch)
-    policy = PresentPolicy({AGENTS: (learner.evaluation_actor(1), learner.actor)}, {}, replicas=REPLICAS)
-    world = CommonsEnv(game, 1, seed=0, first_world=2**31)
-    how = {"title": "cost", "episodes": EPISODES, "live": "serve", "exhibited": (policy, world)}
-    with ViewerCallback(run, env, **how) as watch:
-        watch.filming.every = 10**9
-        watch.exhibition._clock, watch.exhibition._due = clock, clock()
+    policy = CurrentPolicy({AGENTS: (learner.evaluation_actor(1), learner.actor)}, {}, replicas=REPLICAS)
+    world = CommonsEnv(game, 1, seed=0, first_world=EXHIBITED_WORLD)
+
+    def exhibit(trained, logger):
+        return Exhibition(policy, world, trained=trained, logger=logger)
+
+    options = {"title": "cost", "episodes": EPISODES, "live": "serve", "exhibit": exhibit}
+    with ViewerCallback(run, env, **options) as watch:
+        watch.schedule.every = 10**9
+        watch.exhibition._clock = clock
+        watch.exhibition._due = clock()
         before = watch.exhibition.steps, clock()
         live = ratio(watch)
         steps_per_s = (watch.exhibition.steps - before[0]) / (clock() - before[1])
-    return Cost(shown, others, live, every, steps_per_s)
+    return Cost(drawn, others, live, every, steps_per_s)
 
 
 class Witness:
-    """Keeps the episodes that were played, and lets a watch see the turns."""
+    """A callback that keeps the episodes that were played, and lets a watch see the turns."""
 
     def __init__(self, watch: ViewerCallback) -> None:
         self.watch = watch
         self.played: list[Episode] = []
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Lets the watch see it."""
+        """Let the watch see the turn."""
         self.watch.on_step(batch)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Keeps it."""
+        """Keep the episode."""
         self.played.append(episode)
 
 
 def size(run: Path, episodes: int) -> tuple[int, int]:
-    """Bytes of a recording of so many episodes, and the frames in it."""
+    """Return the bytes of a recording of so many episodes, and the frames in it."""
     prepare_process(0)
     game = presets.game("commons")
     env = CommonsEnv(game, REPLICAS, seed=0)
-    chance = np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     at_random = random_agents(game.spaces, AGENTS, replicas=REPLICAS, seed=0)
     with ViewerCallback(run, env, title="size", episodes=episodes) as watch:
         witness = Witness(watch)
@@ -164,28 +180,32 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
         training = Training(env, {}, Schedule(episodes=10**9), others=at_random, callbacks=[witness])
         unseen = TensorDict({}, [REPLICAS])
         for number in range(episodes):
-            if watch.filming.is_shown(number):
+            if watch.schedule.is_shown(number):
                 for _ in range(game.rules.episode_steps):
                     training.step()
             else:
                 witness.on_step(unseen)
             better = 0.1 + 1.1 * number / episodes
-            for replica, nth in enumerate(chance.integers(len(witness.played), size=REPLICAS)):
-                episode = witness.played[nth]
+            for replica, number_played in enumerate(rng.integers(len(witness.played), size=REPLICAS)):
+                episode = witness.played[number_played]
                 metrics = {
                     **episode.metrics,
                     "collective_return": better * episode.metrics["collective_return"],
                 }
-                told = replace(episode, world=replica, replica=replica, episode=number, metrics=metrics)
+                better_episode = replace(
+                    episode, world=replica, replica=replica, episode=number, metrics=metrics
+                )
                 names = [f"agent_{agent}/{name}" for agent in AGENTS for name in ("loss", "epsilon", "q")]
-                observer.on_episode(told, dict(zip(names, chance.random(len(names)).tolist(), strict=True)))
+                observer.on_episode(
+                    better_episode, dict(zip(names, rng.random(len(names)).tolist(), strict=True))
+                )
             if number % FLUSHED_EVERY == 0:
                 watch.logger.flush()
     return watch.logger.path.stat().st_size, watch.logger.frames
 
 
 def main(*, repeats: int = 6, episodes: int = EPISODES) -> None:
-    """Prints the table; ends with exit code 1 where more is taken than is allowed.
+    """Print the table; end with exit code 1 where more is taken than is allowed.
 
     Args:
         repeats: of two episodes with the recording, and two without, for each kind.
@@ -195,9 +215,10 @@ def main(*, repeats: int = 6, episodes: int = EPISODES) -> None:
         time_of = cost(Path(folder), repeats)
     with TemporaryDirectory() as folder:
         size_bytes, frames = size(Path(folder), episodes)
-    time_share, live_share = time_of.share(time_of.others), time_of.share(time_of.live)
+    time_share = time_of.share(time_of.others)
+    live_share = time_of.share(time_of.live)
     table = Table("watching `commons`, 8 replicas", "measured", "allowed", title="the default recording")
-    table.add_row("time, episodes with frames", f"{time_of.shown - 1:+.1%}", "")
+    table.add_row("time, episodes with frames", f"{time_of.drawn - 1:+.1%}", "")
     table.add_row("time, episodes without", f"{time_of.others - 1:+.1%}", "")
     table.add_row(
         f"time, the same served, exhibition at {time_of.steps_per_s:.1f} steps/s",

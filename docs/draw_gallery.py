@@ -22,7 +22,7 @@ import tyro
 from cprl import Experiment
 from cprl.evaluation.film_pictures import write_gif
 from cprl.evaluation.fresh import fresh_episode, record
-from cprl.evaluation.lanes import commons_game
+from cprl.evaluation.populations import commons_game
 from cprl.evaluation.show import about, begins, page, show
 from cprl.pictures.image import world_image
 from cprl.pictures.readable import legend_of

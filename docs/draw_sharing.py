@@ -1,7 +1,4 @@
-"""Draws the herders' game: docs/theory/herders.png.
-
-python docs/draw_sharing.py
-"""
+"""The herders' game, drawn for docs/theory/herders.png by `python docs/draw_figures.py theory`."""
 
 import sys
 from pathlib import Path
@@ -20,8 +17,8 @@ HERDS: Final = (2, 5, 100)
 MANY: Final = np.unique(np.geomspace(1, 100, 60).round().astype(int))
 
 
-def draw() -> None:
-    """What all gain against the animals that graze; animals and the price of anarchy by the herders."""
+def draw_herders() -> None:
+    """Draw what all gain against the animals that graze; animals and the price of anarchy by the herders."""
     with drawing(PATH) as sheet:
         left, middle, right = sheet.panels(3, columns=3, high=23, width_ratios=(1.25, 1, 1))
         one = herders(1)
@@ -33,7 +30,8 @@ def draw() -> None:
             *((f"n = {herd}", herders(herd).nash_total) for herd in HERDS),
         ):
             is_best = name == "optimum"
-            left.plot(at, one.surplus(at), "o", color="black" if is_best else MARK, markersize=6)
+            colour = "black" if is_best else MARK
+            left.plot(at, one.surplus(at), "o", color=colour, markersize=6)
             above = {"xytext": (0, 6), "ha": "center"} if is_best else {"xytext": (6, 4), "ha": "left"}
             left.annotate(name, (at, one.surplus(at)), textcoords="offset points", **above)
         left.set_ylim(-1.2, 1.15 * one.surplus(one.optimum_total))
@@ -41,16 +39,17 @@ def draw() -> None:
         left.set_title("what all gain; red: in equilibrium")
         left.set_xlabel("animals A")
         games = [herders(int(herd)) for herd in MANY]
-        middle.plot(MANY, [own.nash_total for own in games], color=MARK, linewidth=2, label="equilibrium A*")
         middle.plot(
-            MANY, [own.optimum_total for own in games], color="black", linewidth=2, label="optimum A**"
+            MANY, [game.nash_total for game in games], color=MARK, linewidth=2, label="equilibrium A*"
+        )
+        middle.plot(
+            MANY, [game.optimum_total for game in games], color="black", linewidth=2, label="optimum A**"
         )
         access = one.open_access_total
         middle.axhline(access, color=RAW, linestyle=":", linewidth=1.4, label="open access")
         middle.set_ylim(0, 1.1 * access)
         middle.set_title("animals, by the number of herders")
-        middle.legend(loc="lower right")
-        right.plot(MANY, [own.price_of_anarchy for own in games], color=MARK, linewidth=2)
+        right.plot(MANY, [game.price_of_anarchy for game in games], color=MARK, linewidth=2)
         right.set_ylim(0, None)
         right.set_title("gain at the optimum over that in equilibrium")
         for panel in (middle, right):
@@ -60,8 +59,3 @@ def draw() -> None:
             panel.set_xlabel("herders n")
         sheet.title = "The herders' game"
         sheet.caption = "An animal is worth 10 - A^2 and costs 1."
-
-
-if __name__ == "__main__":
-    draw()
-    print(PATH)

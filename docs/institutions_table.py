@@ -25,7 +25,7 @@ from cprl.runs.episodes import read_episodes, read_table
 from cprl.terminal import style
 from cprl.terminal.panels import draw_dots, draw_line
 from cprl.terminal.style import RANDOM_LINE
-from cprl.terminal.tables import Cells, markdown
+from cprl.terminal.text_tables import TextTable, markdown
 
 NONE: Final = "none"
 NAMES: Final = {
@@ -49,12 +49,14 @@ METRICS: Final = {
     "survival_steps": "survival, steps",
     "peacefulness": "peacefulness, steps",
 }
-LAST, SMOOTHED = 30, 10
-"""Episodes at the end that are compared; episodes of a running mean."""
+LAST = 30
+"""The number of episodes at the end that are compared."""
+SMOOTHED = 10
+"""The number of episodes of a running mean."""
 
 
 def ends(runs: Mapping[str, Path]) -> pa.Table:
-    """The last episodes of each replica, labelled by institution."""
+    """Return the last episodes of each replica, labelled by institution."""
     tables = []
     for name, run in runs.items():
         rows = complete(last_of(read_episodes(run), LAST))
@@ -66,8 +68,8 @@ def ends(runs: Mapping[str, Path]) -> pa.Table:
 
 
 def text_of(one: Estimate, *, sign: str = "") -> str:
-    """An estimate with its interval, bold where it differs from 0."""
-    numbers = one.value, *one.interval
+    """Return an estimate with its interval, bold where it differs from 0."""
+    numbers = (one.value, *one.interval)
     digits = 2 if max(map(abs, numbers)) < 5 else 0
     value, low, high = (f"{number:{sign}.{digits}f}" for number in numbers)
     text = f"{value} [{low}, {high}]"
@@ -75,17 +77,18 @@ def text_of(one: Estimate, *, sign: str = "") -> str:
 
 
 def table(head: str, family: Family, *, sign: str = "") -> str:
-    """A Markdown table with a row for each institution."""
-    rows = [
-        [NAMES[name], *(text_of(family[name, metric], sign=sign) for metric in METRICS)]
-        for name in NAMES
-        if (name, "equality") in family
-    ]
-    return "\n".join(markdown(Cells("", [head, *METRICS.values()], rows)))
+    """Return a Markdown table with a row for each institution."""
+    rows = []
+    for name in NAMES:
+        if (name, "equality") in family:
+            cells = [text_of(family[name, metric], sign=sign) for metric in METRICS]
+            rows.append([NAMES[name], *cells])
+    lines = markdown(TextTable("", [head, *METRICS.values()], rows))
+    return "\n".join(lines).replace(r"\*\*", "**")
 
 
 def forest(family: Family, path: Path) -> None:
-    """Draws the paired differences of every metric, with their intervals."""
+    """Draw the paired differences of every metric, with their intervals."""
     names = [name for name in NAMES if (name, "equality") in family]
     with style.drawing(path) as sheet:
         panels = sheet.panels(len(METRICS), columns=4, high=2.4 * len(names) + 6, sharey=True)
@@ -101,7 +104,7 @@ def forest(family: Family, path: Path) -> None:
 
 
 def courses(runs: Mapping[str, Path], path: Path) -> None:
-    """Draws the harvest over the training under each institution, beside none and random play."""
+    """Draw the harvest over the training under each institution, beside none and random play."""
     returns = {name: curves_of(run)["collective_return"] for name, run in runs.items()}
     by_chance = read_table(runs[NONE] / "evaluation" / "random.parquet")
     random = estimates(by_chance, "collective_return")["collective_return"].value
@@ -123,24 +126,34 @@ def courses(runs: Mapping[str, Path], path: Path) -> None:
         sheet.caption = f"Centred means of {SMOOTHED} episodes; bands: 95 % intervals."
 
 
+def draw(runs: Path, figures: Path) -> Family:
+    """Draw the figures of runs, each in a directory of its own name, and return the differences from none."""
+    runs_by_name = finished(runs)
+    changes = differences(ends(runs_by_name), list(METRICS), "institution", {"institution": NONE})
+    figures.mkdir(exist_ok=True)
+    forest(changes, figures / "differences.png")
+    courses(runs_by_name, figures / "courses.png")
+    return changes
+
+
+def finished(runs: Path) -> dict[str, Path]:
+    """Return the runs of a directory that have ended."""
+    return {name: runs / name for name in NAMES if (runs / name / "evaluation").is_dir()}
+
+
 def main(*, runs: Path, figures: Path) -> None:
-    """Prints the tables and draws the figures.
+    """Print the tables and draw the figures.
 
     Args:
         runs: the directory that holds the runs, each in a directory of its own name.
         figures: where the figures are written.
     """
-    found = {name: runs / name for name in NAMES if (runs / name / "evaluation").is_dir()}
-    rows = ends(found)
-    print(table("institution", estimates(rows, list(METRICS), by="institution")))
-    changes = differences(rows, list(METRICS), "institution", {"institution": NONE})
+    changes = draw(runs, figures)
+    print(table("institution", estimates(ends(finished(runs)), list(METRICS), by="institution")))
     print(table("difference from none", changes, sign="+"))
     print(
         f"Bold: not 0 by Holm's method for {changes.tests} comparisons, those that are copies counted once."
     )
-    figures.mkdir(exist_ok=True)
-    forest(changes, figures / "differences.png")
-    courses(found, figures / "courses.png")
 
 
 if __name__ == "__main__":

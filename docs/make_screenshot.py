@@ -24,7 +24,7 @@ def main(
     at_step: int | None = None,
     live_s: float = 0.0,
 ) -> None:
-    """Opens the recording in a headless viewer, waits until the picture is steady, and keeps it.
+    """Open the recording in a headless viewer, wait until the picture is steady, and keep it.
 
     Args:
         source: a .rrd file, or the address of a live run (rerun+http://...).

@@ -8,9 +8,9 @@ from statistics import fmean, stdev
 import tyro
 
 from cprl import CommonsEnv, presets
-from cprl.measuring.evaluate import evaluate
-from cprl.policies.assignment import AgentPolicies
-from cprl.policies.lanes import RandomActor
+from cprl.measuring.playing import evaluate
+from cprl.policies.actors import RandomActor
+from cprl.policies.joint_policy import JointPolicy
 
 APPENDIX_A = {
     "single_basic": (1, 32.47),
@@ -21,7 +21,7 @@ APPENDIX_A = {
 
 
 def main(*, episodes: int = 400, seed: int = 0) -> None:
-    """Prints a row for each board and variant.
+    """Print a row for each board and variant.
 
     Args:
         episodes: played for each.
@@ -33,7 +33,7 @@ def main(*, episodes: int = 400, seed: int = 0) -> None:
         for variant in ("as_run", "published"):
             game = presets.game(board, variant=variant)
             actors = [RandomActor(len(game.actions), seed=seed + agent) for agent in range(game.agents)]
-            played = evaluate(CommonsEnv(game, episodes, seed=seed), AgentPolicies(actors))
+            played = evaluate(CommonsEnv(game, episodes, seed=seed), JointPolicy(actors))
             returns = [float(episode.return_.sum()) for episode in played]
             peace = [episode.metrics["peacefulness"] for episode in played]
             ours, calm = (f"{fmean(x):.2f} ± {stdev(x) / episodes**0.5:.2f}" for x in (returns, peace))

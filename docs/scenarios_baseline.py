@@ -18,9 +18,9 @@ import tyro
 from scipy import stats
 
 import cprl
-from cprl.evaluation import advantages, draw_scenarios, run_scenarios
+from cprl.evaluation import draw_scenarios, run_scenarios, scenario_advantages
 from cprl.measuring.statistics import CONFIDENCE, holm
-from cprl.measuring.table import numbers_in
+from cprl.measuring.table import all_metrics
 from cprl.runs.files import write_atomically
 from cprl.system.process import prepare_process
 
@@ -29,7 +29,7 @@ OUT: Final = DOCS / "results" / "scenarios"
 POPULATIONS: Final = ("two_complex", "commons", "commons_published", "two_complex_no_beam")
 """Folders of docs/results with weights, one for each game that has a stored background."""
 EPISODES: Final = 4
-"""Of each replica in each placement."""
+"""The episodes of each replica in each placement."""
 SEED: Final = 30_011
 """No training of ours uses it."""
 
@@ -48,7 +48,7 @@ COLUMNS: Final = {
 
 
 def play(name: str, *, episodes: int) -> None:
-    """Plays a population's scenarios, and writes the estimates and the figure."""
+    """Play a population's scenarios, and write the estimates and the figure."""
     played = run_scenarios(DOCS / "results" / name, cprl.Fresh(episodes=episodes, seed=SEED))
     OUT.mkdir(exist_ok=True)
     draw_scenarios(played, OUT / f"{name}.png")
@@ -57,15 +57,16 @@ def play(name: str, *, episodes: int) -> None:
 
 
 def estimates_of(played: pa.Table) -> pa.Table:
-    """Every number of every scenario as a row: "scenario", "focal" (who takes the focal places), "metric",
-    "value", "low" and "high", and how many "replicas", "episodes" and "undefined" episodes there were.
+    """Return every number of every scenario as a row.
 
+    Its columns are "scenario", "focal" (the agents in the focal places), "metric", "value", "low" and "high",
+    and how many "replicas", "episodes" and "undefined" episodes there were.
     Metrics "focal/advantage" and "background/advantage" of "random" and "greedy" are what the run's agents,
     or the background among them, get more.
     """
     returns = ("focal/return", "background/return")
-    levels = cprl.estimates(played, [*returns, *numbers_in(played)], by=("scenario", "focal")).table()
-    more = advantages(played).table()
+    levels = cprl.estimates(played, [*returns, *all_metrics(played)], by=("scenario", "focal")).table()
+    more = scenario_advantages(played).table()
     renamed = [name.replace("return", "advantage") for name in more["number"].to_pylist()]
     more = more.set_column(more.column_names.index("number"), "number", pa.array(renamed))
     found = pa.concat_tables([levels, more], promote_options="default").select(
@@ -75,7 +76,7 @@ def estimates_of(played: pa.Table) -> pa.Table:
 
 
 def table(name: str) -> str:
-    """The Markdown table of a population; bold is what is not 0 by Holm's method for all of it."""
+    """Return the Markdown table of a population; bold is what is not 0 by Holm's method for all of it."""
     with (OUT / f"{name}.csv").open() as file:
         rows = list(csv.DictReader(file))
     found = {(row["scenario"], row["focal"], row["metric"]): row for row in rows}
@@ -96,14 +97,14 @@ def is_difference(_: str, metric: str) -> bool:
 
 
 def p_value(row: dict[str, Any]) -> float:
-    """That of the difference being 0, from its interval by Student's t."""
+    """Return the p-value of a difference of 0, from its interval by Student's t."""
     freedom = int(row["replicas"]) - 1
     error = (float(row["high"]) - float(row["low"])) / 2 / stats.t.ppf((1 + CONFIDENCE) / 2, freedom)
     return float(2 * stats.t.sf(abs(float(row["value"])) / error, freedom))
 
 
 def shown(row: dict[str, Any], *, signed: bool) -> str:
-    """An estimate with its interval."""
+    """Return an estimate with its interval."""
     if not row["value"]:
         return "undefined"
     value, low, high = (float(row[bound]) for bound in ("value", "low", "high"))
@@ -113,7 +114,7 @@ def shown(row: dict[str, Any], *, signed: bool) -> str:
 
 
 def main(*, tables: bool = False, episodes: int = EPISODES) -> None:
-    """Plays the scenarios, or prints their tables.
+    """Play the scenarios, or print their tables.
 
     Args:
         tables: print the tables of what has been played, and play nothing.

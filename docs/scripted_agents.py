@@ -8,20 +8,20 @@ from statistics import fmean
 import tyro
 
 from cprl import CommonsEnv, presets
-from cprl.measuring.evaluate import evaluate, mean_return
-from cprl.policies.assignment import AgentPolicies
+from cprl.measuring.playing import evaluate, mean_return
+from cprl.policies.joint_policy import JointPolicy
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedActor
 
 
 def main(*, board: presets.Board = "commons", episodes: int = 20, seed: int = 0) -> None:
-    """Prints, for each policy, means over episodes; the return with its standard error."""
+    """Print, for each policy, means over episodes; the return with its standard error."""
     game = presets.game(board)
     everyone = tuple(range(game.agents))
     print("| policy | return of all | steps | apples left | shots | tagged |\n|---|---:|---:|---:|---:|---:|")
     for policy in SCRIPTED_POLICIES:
         seeds = [(seed, agent) for agent in everyone]
         actor = ScriptedActor(policy, game, seeds=seeds, agents=len(everyone), worlds=episodes)
-        played = evaluate(CommonsEnv(game, episodes, seed=seed), AgentPolicies({everyone: actor}))
+        played = evaluate(CommonsEnv(game, episodes, seed=seed), JointPolicy({everyone: actor}))
         return_, error = mean_return(played)
         numbers = [
             [float(episode.steps), float(episode.stock_left), episode.shots.sum(), episode.tagged.sum()]

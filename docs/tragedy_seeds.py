@@ -23,12 +23,14 @@ HEADING = (
 
 
 def main(runs: list[Path]) -> None:
-    """Prints a row for each run."""
+    """Print a row for each run."""
     print(HEADING)
     print("|" + "---:|" * HEADING.count(" | ") + "---|")
     for run in runs:
-        stored, at_end = load(run), curves_of(run, last=30)
-        returns, lengths = curves_of(run)["collective_return"], at_end["survival_steps"].mean(1)
+        stored = load(run)
+        at_end = curves_of(run, last=30)
+        returns = curves_of(run)["collective_return"]
+        lengths = at_end["survival_steps"].mean(1)
         first = int(running_mean(returns.mean(0), 10).argmax())
         last = estimate(at_end["collective_return"].mean(1))
         random = as_curves(read_table(run / "evaluation" / "random.parquet"))["collective_return"]
@@ -36,17 +38,17 @@ def main(runs: list[Path]) -> None:
         cells = [
             stored.experiment.seed,
             len(returns),
-            _told(estimate(returns[:, first : first + 10].mean(1))),
+            _text_of(estimate(returns[:, first : first + 10].mean(1))),
             first,
-            _told(last),
+            _text_of(last),
             f"{last.value / random.mean() - 1:+.0%} of {random.mean():.0f} ± {error:.1f}",
-            _told(estimate(lengths)),
+            _text_of(estimate(lengths)),
             "yes" if "the tragedy of the commons" in course_of(run, stored.specs) else "no",
         ]
         print("| " + " | ".join(map(str, cells)) + " |")
 
 
-def _told(found: Estimate) -> str:
+def _text_of(found: Estimate) -> str:
     return f"{found.value:.0f} [{found.low:.0f}, {found.high:.0f}]"
 
 

@@ -24,7 +24,9 @@ from rerun.experimental import ViewerClient
 VIEWER = Path(rerun_cli.__path__[0]) / "rerun"
 """The viewer itself: the console script `rerun` would leave it running when it is ended."""
 
-START_S, STEADY_S, BUSY_S = 120.0, 300.0, 600.0
+START_S = 120.0
+STEADY_S = 300.0
+BUSY_S = 600.0
 """The longest waits, on a machine with much other work."""
 
 CHROMIUM = (
@@ -62,7 +64,7 @@ def native_viewer(
 
 
 def _remote_control(port: int, viewer: "subprocess.Popen[bytes]") -> ViewerClient:
-    """Of a viewer, once it answers."""
+    """Return the address of a viewer, once it answers."""
     found: list[ViewerClient] = []
 
     def answers() -> bool:
@@ -83,7 +85,7 @@ def _remote_control(port: int, viewer: "subprocess.Popen[bytes]") -> ViewerClien
 
 
 def steady_picture(client: ViewerClient) -> bytes:
-    """A screenshot that two looks in a row agree on, PNG."""
+    """Return a screenshot that two looks in a row agree on, PNG."""
     seen: list[bytes] = [b"", client.take_screenshot()]
 
     def steady() -> bool:
@@ -142,19 +144,19 @@ class Browser:
         self._session = session
 
     def __call__(self) -> bytes:
-        """A picture of what is in the window, PNG."""
+        """Return a picture of what is in the window, PNG."""
         return base64.b64decode(_patiently(f"{self._session}/screenshot"))
 
     def open(self, page: str) -> None:
-        """Opens an address, and waits until it is loaded."""
+        """Open an address, and wait until it is loaded."""
         _asked(f"{self._session}/url", {"url": page})
 
     def run(self, script: str) -> Any:
-        """What a piece of JavaScript returns in the page."""
+        """Return what a piece of JavaScript returns in the page."""
         return _asked(f"{self._session}/execute/sync", {"script": script, "args": []})
 
     def resize(self, width: int, height: int) -> None:
-        """Shows the page as a device of this size would; windows of Chromium are 500 wide at least."""
+        """Show the page as a device of this size would; windows of Chromium are 500 wide at least."""
         sizes = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
         command = {"cmd": "Emulation.setDeviceMetricsOverride", "params": sizes}
         _asked(f"{self._session}/goog/cdp/execute", command)
@@ -168,7 +170,7 @@ def _is_ready(address: str) -> bool:
 
 
 def _patiently(address: str) -> Any:
-    """What WebDriver answers at last: it waits ten seconds for a page, which may be busy drawing on a CPU."""
+    """Return what WebDriver answers at last: it waits ten seconds for a page that may be busy drawing."""
     began = time.monotonic()
     while True:
         try:
@@ -181,7 +183,7 @@ def _patiently(address: str) -> Any:
 
 
 def _asked(address: str, body: Mapping[str, Any] | None = None, *, method: str | None = None) -> Any:
-    """What WebDriver answers."""
+    """Return what WebDriver answers."""
     data = None if body is None else json.dumps(body).encode()
     request = Request(address, data, {"Content-Type": "application/json"}, method=method)
     try:
@@ -192,14 +194,14 @@ def _asked(address: str, body: Mapping[str, Any] | None = None, *, method: str |
 
 
 def free_port() -> int:
-    """A port of 127.0.0.1 that nobody listens at."""
+    """Return a port of 127.0.0.1 that nobody listens at."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def wait_until(condition: Callable[[], bool], limit_s: float, trouble: str, *, every_s: float = 0.2) -> None:
-    """Waits for a condition, at most so long."""
+    """Wait for a condition, at most so long."""
     began = time.monotonic()
     while not condition():
         if time.monotonic() - began > limit_s:

@@ -22,5 +22,5 @@ extended = cprl.run(short, out / "extended", watch="off", keep_checkpoint=True)
 cprl.run(long, extended, watch="off", resume=True)
 
 whole = cprl.run(long, out / "whole", watch="off")
-table, of_whole = (read_episodes(run).to_pylist() for run in (extended, whole))
-print(f"the same episodes: {str(table) == str(of_whole)}")  # as text, since NaN is unequal to itself
+table, whole_table = (read_episodes(run).to_pylist() for run in (extended, whole))
+print(f"the same episodes: {str(table) == str(whole_table)}")  # as text, since NaN is unequal to itself

@@ -30,7 +30,9 @@ class StagHunt:
 class StagHuntEnv(EnvBase):  # both observe the last actions; the turn is in the TensorDict: no other state
     def __init__(self, turns, worlds, device):
         super().__init__(batch_size=[worlds], device=device)
-        self.turns, batch, each = turns, (worlds,), (worlds, 2)
+        self.turns = turns
+        batch = (worlds,)
+        each = (worlds, 2)
         agents = Composite(observation=Unbounded((*each, 2)), shape=each)
         turn = Unbounded((worlds, 1), dtype=torch.int64)
         self.observation_spec = Composite(agents=agents, turn=turn, shape=batch)
@@ -43,7 +45,8 @@ class StagHuntEnv(EnvBase):  # both observe the last actions; the turn is in the
         return self.observation_spec.zero().update(self.done_spec.zero())
 
     def _step(self, tensordict):
-        action, turn = tensordict["agents", "action"], tensordict["turn"] + 1
+        action = tensordict["agents", "action"]
+        turn = tensordict["turn"] + 1
         seen = action.float().unsqueeze(1).expand(-1, 2, -1)
         reward = PAYOFF[action, action.flip(1)].unsqueeze(-1)
         agents = TensorDict({"observation": seen, "reward": reward}, action.shape)

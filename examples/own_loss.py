@@ -17,14 +17,14 @@ from cprl.runs.curves import curves_of
 
 
 def huber(network, settings):
-    """One of TorchRL's: errors above 1 count by their size, not by their square."""
+    """Return one of TorchRL's losses: errors above 1 count by their size, not by their square."""
     loss = DQNLoss(q_actor(network), loss_function="smooth_l1", delay_value=True, action_space="categorical")
     loss.make_value_estimator(gamma=settings.gamma)
     return loss
 
 
 class Hysteretic(LossModule):
-    """Learns more slowly from disappointments than from good news (Matignon et al. 2007)."""
+    """A loss that learns more slowly from disappointments than from good news (Matignon et al. 2007)."""
 
     values: TensorDictModule
     values_params: TensorDictParams
@@ -34,7 +34,8 @@ class Hysteretic(LossModule):
         super().__init__()
         values = TensorDictModule(network, ["observation"], ["value"])
         self.convert_to_functional(values, "values", create_target_params=True)
-        self.gamma, self.slow = settings.gamma, slow
+        self.gamma = settings.gamma
+        self.slow = slow
 
     def value(self, weights, turn):
         with weights.to_module(self.values, preserve_module_state=False):

@@ -7,7 +7,7 @@ from cprl.population import Scripted
 
 
 def largest_share(episode):
-    """The share of all harvested apples that the agent with most harvested."""
+    """Return the share of all harvested apples that the agent with most harvested."""
     return episode.harvest.max() / episode.harvest.sum()  # NaN, undefined, where nobody harvested
 
 

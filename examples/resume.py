@@ -13,7 +13,7 @@ from cprl.runs.episodes import read_episodes
 
 
 class CtrlC:
-    """Stops the training after so many turns, as Ctrl-C does."""
+    """A callback that stops the training after so many turns, as Ctrl-C does."""
 
     turns = 0
 
@@ -37,5 +37,5 @@ except KeyboardInterrupt:
 stopped = cprl.run(experiment, out / "stopped", watch="off", resume=True)
 
 whole = cprl.run(experiment, out / "whole", watch="off")
-table, of_whole = (read_episodes(run).to_pylist() for run in (stopped, whole))
-print(f"the same episodes: {str(table) == str(of_whole)}")  # as text, since NaN is unequal to itself
+parts = [str(read_episodes(run).to_pylist()) for run in (stopped, whole)]
+print(f"the same episodes: {parts[0] == parts[1]}")  # as text, since NaN is unequal to itself

@@ -24,7 +24,7 @@ def experiment(
     optimizer: Optimizer = "adam",
     loss_function: Literal["l1", "l2", "smooth_l1", "log_cosh"] = "l2",
 ) -> cprl.Experiment:
-    """Four independent DQN agents on `commons`.
+    """Train four independent DQN agents on `commons`.
 
     Args:
         variant: the rules and the learner as the study is written, or as it was run.

@@ -28,7 +28,7 @@ from cprl.institutions import (
 from cprl.population import Learning
 
 SHORT = {"learning_rate": 1e-4, "epsilon_decay_steps": 100_000, "gamma": 0.95}
-"""What differs from the published schedule, as in recipes/study/base.py."""
+"""The differences from the published schedule, as in recipes/study/base.py."""
 
 Choice = Literal[
     "none",
@@ -42,9 +42,10 @@ Choice = Literal[
     "levies",
 ]
 
-SHARE, WINDOW = 0.25, 50
-"""Of every quota here: a quarter of the map's proven yield, counted in windows of 50 turns: 6.9 apples
-per agent and window, of which an agent may take 6."""
+SHARE = 0.25
+WINDOW = 50
+"""The share and the window of every quota here: a quarter of the map's proven yield, counted in windows of 50
+turns: 6.9 apples per agent and window, of which an agent may take 6."""
 
 INSTITUTIONS: dict[Choice, tuple[Institution, ...]] = {
     "none": (),
@@ -64,13 +65,13 @@ INSTITUTIONS: dict[Choice, tuple[Institution, ...]] = {
 
 
 def experiment(*, institution: Choice = "none") -> cprl.Experiment:
-    """Four independent DQN agents on `commons` under an institution.
+    """Train four independent DQN agents on `commons` under an institution.
 
     Args:
         institution: which one, by its name.
     """
     game = presets.game("commons", variant="as_run")
-    apart = any(isinstance(own, Mediation) for own in INSTITUTIONS[institution])
+    apart = any(isinstance(rule, Mediation) for rule in INSTITUTIONS[institution])
     settings = replace(presets.dqn_settings("commons", variant="as_run"), **SHORT)
     return cprl.Experiment(
         name=f"institutions_{institution}",

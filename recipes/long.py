@@ -15,7 +15,7 @@ from cprl.population import Learning
 
 
 def experiment() -> cprl.Experiment:
-    """Four independent PPO agents on `commons`, by the rules of the study as run."""
+    """Train four independent PPO agents on `commons`, by the rules of the study as run."""
     settings = RolloutSettings(rollout_steps=64, minibatch_size=2048, epochs=4)
     return cprl.Experiment(
         name="long",

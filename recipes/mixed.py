@@ -16,13 +16,14 @@ from cprl.population import Learning, Scripted
 
 
 def experiment(*, neighbour: ScriptedPolicy = "sustainable") -> cprl.Experiment:
-    """Two DQN agents, one PPO agent and one that follows a rule on `commons`.
+    """Train two DQN agents and one PPO agent beside one that follows a rule on `commons`.
 
     Args:
         neighbour: the rule that agent 3 follows.
     """
     settings = replace(presets.dqn_settings("commons"), learning_rate=1e-4, epsilon_decay_steps=100_000)
-    dqn, ppo = Learning(DQN(settings=settings)), Learning(PPO(settings=RolloutSettings()))
+    dqn = Learning(DQN(settings=settings))
+    ppo = Learning(PPO(settings=RolloutSettings()))
     return cprl.Experiment(
         name="mixed",
         game=presets.game("commons"),

@@ -26,22 +26,22 @@ import cprl
 from cprl import CommonsEnv, presets
 from cprl.algorithms import DQN
 from cprl.algorithms.base import q_actor
-from cprl.commands.recipe import in_a_sentence
-from cprl.learners.base import AnyLearner
+from cprl.commands.recipe_command import exit_with_message
 from cprl.learners.lanes import Lanes
-from cprl.measuring.episodes import Episode, EpisodeTracker
-from cprl.measuring.evaluate import evaluate, mean_return
+from cprl.learners.protocol import AnyLearner
+from cprl.measuring.playing import evaluate, mean_return
 from cprl.measuring.series import Observer
 from cprl.measuring.table import labelled, where
-from cprl.policies.assignment import AgentPolicies
-from cprl.policies.lanes import RandomActor
+from cprl.measuring.tracker import Episode, EpisodeTracker
+from cprl.policies.actors import RandomActor
+from cprl.policies.joint_policy import JointPolicy
 from cprl.population import Learning, exploration_steps
 from cprl.runs.episodes import EpisodeTable, table_of
 from cprl.runs.recipe import start_run
 from cprl.runs.schedule import Schedule
 from cprl.runs.weights import load_weights, save_weights
-from cprl.system.output import printed, say
-from cprl.system.shipped import cprl_here
+from cprl.system.output import quote_command, say
+from cprl.system.shipped import cprl_command
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
@@ -50,14 +50,14 @@ from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.page import check_watch
 
 SHORT = {"epsilon_decay_steps": 30_000, "batch_size": 64, "learning_rate": 3e-4, "target_every_episodes": 1}
-"""What differs from the published schedule, besides the number of episodes: it has to learn from 1/50 of the
-steps."""
+"""The differences from the published schedule, besides the number of episodes: it has to learn from 1/50 of
+the steps."""
 
 
 class BestWeights:
-    """Evaluates the greedy policy every `every` episodes, and saves the best weights so far.
+    """A callback that evaluates the greedy policy every `every` episodes, and saves the best weights so far.
 
-    A callback of `cprl.training`. It evaluates in the same worlds every time, so measure the saved weights
+    It evaluates in the same worlds every time, so measure the saved weights
     in other worlds. A policy that harvests nothing is never the best, where the game reports harvests; until
     one harvests something `path` is None and `best_episode` is -1.
     """
@@ -72,14 +72,20 @@ class BestWeights:
         every: int = 10,
         logger: Logger | None = None,
     ) -> None:
-        self.run, self.networks, self.policy, self.env = run, networks, policy, env
-        self.every, self.logger = every, logger
+        self.run = run
+        self.networks = networks
+        self.policy = policy
+        self.env = env
+        self.every = every
+        self.logger = logger
         self.seed = int(env.worlds.now.seed[0, 0])
         self.path: Path | None = None
-        self.best_return, self.best_episode, self._episodes = float("-inf"), -1, 0
+        self.best_return = float("-inf")
+        self.best_episode = -1
+        self._episodes = 0
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Counts an episode; every `every` episodes evaluates, and saves the weights if they are better."""
+        """Count an episode; every `every` episodes evaluate, and save the weights if they are better."""
         self._episodes += 1
         if self._episodes % self.every:
             return
@@ -92,7 +98,8 @@ class BestWeights:
         if harvests and not any(harvest.any() for harvest in harvests):
             return
         if reached > self.best_return:
-            self.best_return, self.best_episode = reached, self._episodes
+            self.best_return = reached
+            self.best_episode = self._episodes
             self.path = save_weights(self.run, self.networks(), name="best")
 
 
@@ -104,7 +111,7 @@ def main(
     out: Path | None = None,
     watch: str = "file",
 ) -> Path:
-    """Trains the agent, evaluates it on fresh worlds, and returns the run's directory.
+    """Train the agent, evaluate it on fresh worlds, and return the run's directory.
 
     Args:
         episodes: how many to train.
@@ -129,18 +136,20 @@ def main(
     torch.set_num_threads(1)
     logging.getLogger("torchrl").setLevel(logging.WARNING)
     run = start_run(out, experiment.name, experiment.to_recipe)
-    env, trial = CommonsEnv(game, seed=seed), CommonsEnv(game, 16, seed=seed + 1)
+    env = CommonsEnv(game, seed=seed)
+    trial = CommonsEnv(game, 16, seed=seed + 1)
 
     lanes = Lanes(game.spaces, agents=(0,), replicas=1, seed=seed)
     learner = algorithm.make_learner(lanes, "torchrl")
-    policy = AgentPolicies({(0,): learner.evaluation_actor(worlds=16)})
+    policy = JointPolicy({(0,): learner.evaluation_actor(worlds=16)})
 
     def networks() -> dict[str, nn.Module]:
         return {"agent_0": learner.networks()["replica_0/agent_0"]}
 
-    live, shown = None if watch == "file" else watch, experiment.to_config()
+    recipe = experiment.to_config()
+    live = None if watch == "file" else watch
     with (
-        ViewerCallback(run, env, title=title, episodes=episodes, recipe=shown, live=live) as viewer,
+        ViewerCallback(run, env, title=title, episodes=episodes, recipe=recipe, live=live) as viewer,
         EpisodeTable(run / "episodes.parquet") as table,
         ProgressBar(Schedule(episodes=episodes), game) as bar,
     ):
@@ -150,9 +159,9 @@ def main(
     save_weights(run, networks())
 
     fresh = CommonsEnv(game, evaluation_episodes, seed=seed + 2)
-    played = {"random": evaluate(fresh, AgentPolicies([RandomActor(len(game.actions), seed=seed)]))}
+    played = {"random": evaluate(fresh, JointPolicy([RandomActor(len(game.actions), seed=seed)]))}
     network = networks()["agent_0"]
-    greedy = AgentPolicies([q_actor(network)])
+    greedy = JointPolicy([q_actor(network)])
     played["greedy, last"] = evaluate(fresh, greedy)
     if best.path:
         network.load_state_dict(load_weights(best.path)["agent_0"])
@@ -163,17 +172,17 @@ def main(
     figure = training_curve(run, title=title, random=random, exploration_turns=ends)
     note = None if best.path else "No best weights: greedy play harvested nothing whenever it was tried"
     summarise(run, title=title, played=table, figure=figure, note=note)
-    published = printed([*cprl_here(), "run", "single_basic"])
+    published = quote_command([*cprl_command(), "run", "single_basic"])
     say(f"This was a shortened schedule. The published one, with 8 replicas: {published}")
     return run
 
 
 def learn(env: CommonsEnv, learner: AnyLearner, episodes: int, *, callbacks: Sequence[Callback]) -> None:
-    """Acts, stores, learns and measures, turn by turn."""
+    """Act, store, learn and measure, turn by turn."""
     tracker = EpisodeTracker(1, env.game.agents)
     observer = Observer(callbacks, env)
     losses: list[float] = []
-    for turn in StepCollector(env, AgentPolicies({learner.agents: learner.actor})):
+    for turn in StepCollector(env, JointPolicy({learner.agents: learner.actor})):
         learner.store(turn)
         loss = learner.update()
         if loss is not None:
@@ -193,5 +202,5 @@ def learn(env: CommonsEnv, learner: AnyLearner, episodes: int, *, callbacks: Seq
 
 
 if __name__ == "__main__":
-    with in_a_sentence("own_loop.py"):
+    with exit_with_message("own_loop.py"):
         tyro.cli(main)

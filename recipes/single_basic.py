@@ -12,7 +12,7 @@ from cprl.population import Learning
 
 
 def experiment(*, variant: presets.Variant = "published") -> cprl.Experiment:
-    """One DQN agent alone on `single_basic`.
+    """Train one DQN agent alone on `single_basic`.
 
     Args:
         variant: the rules and the learner as the study is written, or as it was run.

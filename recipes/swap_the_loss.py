@@ -30,7 +30,7 @@ LOSSES = {
 
 
 def experiment(*, loss: Literal["dqn", "double_dqn", "cql", "sac", "iql", "ppo"] = "dqn") -> cprl.Experiment:
-    """Two agents on `two_complex` that learn by the same loss.
+    """Train two agents on `two_complex` by the same loss.
 
     Args:
         loss: by which both learn.

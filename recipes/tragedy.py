@@ -14,8 +14,8 @@ import cprl
 from cprl import presets
 from cprl.algorithms import DQN
 from cprl.population import Learning
-from cprl.system.output import printed, say
-from cprl.system.shipped import cprl_here
+from cprl.system.output import quote_command, say
+from cprl.system.shipped import cprl_command
 
 WORLDS = 16
 SHORT = {
@@ -25,7 +25,7 @@ SHORT = {
     "steps_per_update": WORLDS,  # so one update a turn
     "batch_size": 64,
 }
-"""What differs from the published schedule, besides the numbers of worlds and episodes."""
+"""The differences from the published schedule, besides the numbers of worlds and episodes."""
 
 NEXT = """\
 This was a short schedule. The published one, 8 replicas of 4,800 episodes, takes hours:
@@ -40,7 +40,7 @@ Three things to try next:
 
 
 def experiment() -> cprl.Experiment:
-    """Four independent DQN agents on `commons`, on a short schedule."""
+    """Train four independent DQN agents on `commons`, on a short schedule."""
     settings = replace(presets.dqn_settings("commons", variant="as_run"), **SHORT)
     return cprl.Experiment(
         name="tragedy",
@@ -53,10 +53,10 @@ def experiment() -> cprl.Experiment:
     )
 
 
-def tell(run: Path) -> None:
-    """Says what to try next."""
-    say(NEXT.format(run=printed([str(run)]), cprl=printed(cprl_here())))
+def print_next(run: Path) -> None:
+    """Print what to try next."""
+    say(NEXT.format(run=quote_command([str(run)]), cprl=quote_command(cprl_command())))
 
 
 if __name__ == "__main__":
-    cprl.recipe_main(experiment, at_end=tell)
+    cprl.recipe_main(experiment, at_end=print_next)

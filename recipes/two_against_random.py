@@ -12,7 +12,7 @@ from cprl.population import Learning, Scripted
 
 
 def experiment(*, variant: presets.Variant = "published") -> cprl.Experiment:
-    """A DQN agent beside a random walker on `two_complex`.
+    """Train a DQN agent beside a random walker on `two_complex`.
 
     Args:
         variant: the rules and the learner as the study is written, as it was run, or as an earlier version of

@@ -15,7 +15,7 @@ from cprl.population import Learning
 
 
 def experiment(*, variant: presets.Variant = "published", beam: bool = True) -> cprl.Experiment:
-    """Two independent DQN agents on `two_complex`.
+    """Train two independent DQN agents on `two_complex`.
 
     Args:
         variant: the rules and the learner as the study is written, as it was run, or as an earlier version of
@@ -24,8 +24,9 @@ def experiment(*, variant: presets.Variant = "published", beam: bool = True) -> 
     """
     game = presets.game("two_complex", variant=variant)
     settings = presets.dqn_settings("two_complex", variant=variant)
+    name = "two_complex" if beam else "two_complex_no_beam"
     return cprl.Experiment(
-        name="two_complex" if beam else "two_complex_no_beam",
+        name=name,
         game=replace(game, rules=replace(game.rules, may_fire=beam)),
         agents=(Learning(DQN(settings=settings)),) * 2,
         episodes=6000,

@@ -6,13 +6,14 @@ from dataclasses import replace
 
 import pytest
 import torch
+from places import TESTS
 
 import cprl
 from cprl import presets
 from cprl.algorithms import DQN
-from cprl.commons.compiled import PLAIN, RULES_VARIABLE
+from cprl.commons.compiled import PLAIN_RULES, RULES_VARIABLE
 from cprl.population import Learning, Scripted
-from cprl.values import OWN_METRICS, trusting
+from cprl.values import METRIC_WORDS, trusting
 
 
 def pytest_addoption(parser):
@@ -20,8 +21,11 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    # Processes that tests start import from the same folders as the tests.
+    folders = [str(path) for path in config.getini("pythonpath") if path.is_relative_to(TESTS)]
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [*folders, os.environ.get("PYTHONPATH", "")]))
     if config.getoption("--plain"):
-        os.environ[RULES_VARIABLE] = PLAIN
+        os.environ[RULES_VARIABLE] = PLAIN_RULES
 
 
 @pytest.fixture(autouse=True)
@@ -42,12 +46,12 @@ def trusted():
 def names_of_metrics():
     """What a test, or code of the docs that it runs, calls a metric of its own is forgotten after it."""
     yield
-    OWN_METRICS.clear()
+    METRIC_WORDS.clear()
 
 
 @pytest.fixture
 def stopped(monkeypatch):
-    """Trains an experiment with a callback of `one_road_parts`, which ends the process at a step."""
+    """Trains an experiment with a callback of `own_parts`, which ends the process at a step."""
 
     def run_until(at_step, experiment, out, **options):
         monkeypatch.setenv("STOP_AT_STEP", str(at_step))

@@ -29,11 +29,13 @@ ORIGINALS = {
 
 
 def play(game: Game, *, episodes: int = 400, seed: int = 0) -> dict[str, Any]:
-    """Random play of a first episode in so many worlds: each measure, float [episodes]."""
-    batch, rng = Batch(game, episodes, seed=seed), np.random.default_rng(seed)
-    output = batch.begin(batch.new_output())
+    """Return each measure of random play of a first episode in so many worlds, float [episodes]."""
+    batch = Batch(game, episodes, seed=seed)
+    rng = np.random.default_rng(seed)
+    output = batch.begin()
     names = ("harvest", "regrown", "tags", "steps", "reward", "waste")
-    sums, is_over = {name: np.zeros(episodes) for name in names}, np.zeros(episodes, np.bool_)
+    sums = {name: np.zeros(episodes) for name in names}
+    is_over = np.zeros(episodes, np.bool_)
     while not is_over.all():
         output = batch.play(rng.integers(len(game.actions), size=(episodes, game.agents)), output)
         waste = output.waste.sum(1) / game.rules.episode_steps
@@ -66,9 +68,11 @@ if __name__ == "__main__":
     print("| original | episodes | measure | original's mean | ours, 400 episodes | z |")
     print("|---|---:|---|---:|---:|---:|")
     for name in ORIGINALS:
-        theirs, ours = json.loads((STORED / f"{name}.json").read_text()), play(game_beside(name))
+        theirs = json.loads((STORED / f"{name}.json").read_text())
+        ours = play(game_beside(name))
         for measure in theirs:
-            first, second = np.array(theirs[measure], float), ours[measure]
+            first = np.array(theirs[measure], float)
+            second = ours[measure]
             error = np.hypot(*(values.std(ddof=1) / len(values) ** 0.5 for values in (first, second)))
             z = (second.mean() - first.mean()) / error if error > 0 else 0.0
             means = f"{first.mean():,.1f} | {second.mean():,.1f}"

@@ -12,23 +12,28 @@ import json
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 PLAYERS = 7
-MOVES, TURNS = (0, 1, 3, 4, 2, 0, 0, 0), (0, 0, 0, 0, 0, -1, 1, 0)
+MOVES = (0, 1, 3, 4, 2, 0, 0, 0)
+TURNS = (0, 0, 0, 0, 0, -1, 1, 0)
 """By action: stay, forward, backward, left, right, turn left, turn right, zap."""
 ZAP = 7
-SPRITE, APPLE, BEAM = 8, (214, 88, 88), (252, 252, 106)
-"""Pixels a cell, and colours that only apples and beams have."""
+SPRITE = 8
+"""Pixels a cell."""
+APPLE = (214, 88, 88)
+BEAM = (252, 252, 106)
+"""The colours that only apples and beams have."""
 STEPS = ((-1, 0), (0, 1), (1, 0), (0, -1))
 """By heading: north, east, south, west."""
 
 
 def environment(name: str, seed: int, change: Any = None) -> Any:
-    """A substrate; `change` may alter its settings before it is built."""
+    """Return a substrate; `change` may alter its settings before it is built."""
     from meltingpot.utils.substrates import builder
 
     module = importlib.import_module(f"meltingpot.configs.substrates.commons_harvest__{name}")
@@ -39,8 +44,8 @@ def environment(name: str, seed: int, change: Any = None) -> Any:
     return builder.builder(settings, env_seed=seed)
 
 
-def words(actions: Any) -> dict[str, int]:
-    """The actions of all players as the environment takes them."""
+def environment_actions(actions: Any) -> dict[str, int]:
+    """Return the actions of all players as the environment takes them."""
     return {
         f"{player + 1}.{word}": value
         for player, action in enumerate(actions)
@@ -53,22 +58,22 @@ def words(actions: Any) -> dict[str, int]:
 
 
 def stock(observation: Any) -> Any:
-    """The cells that show an apple, bool [rows, columns]; an avatar hides the one under it."""
+    """Return the cells that show an apple, bool [rows, columns]; an avatar hides the one under it."""
     is_apple = (observation["WORLD.RGB"] == APPLE).all(-1)
     rows, columns = (side // SPRITE for side in is_apple.shape)
     return is_apple.reshape(rows, SPRITE, columns, SPRITE).any((1, 3))
 
 
 def hidden(observation: Any) -> Any:
-    """The cells that a beam covers, bool [rows, columns]."""
+    """Return the cells that a beam covers, bool [rows, columns]."""
     is_beam = (observation["WORLD.RGB"] == BEAM).all(-1)
     rows, columns = (side // SPRITE for side in is_beam.shape)
     return is_beam.reshape(rows, SPRITE, columns, SPRITE).any((1, 3))
 
 
 def zaps(env: Any) -> list[tuple[int, int]]:
-    """Who hit whom in the last frame, counted from 0."""
-    return [(int(found[2]) - 1, int(found[4]) - 1) for name, found in env.events() if name == "zap"]
+    """Return who hit whom in the last frame, counted from 0."""
+    return [(int(zap[2]) - 1, int(zap[4]) - 1) for name, zap in env.events() if name == "zap"]
 
 
 def episodes(name: str, count: int, seed: int) -> Iterator[dict[str, int]]:
@@ -76,9 +81,11 @@ def episodes(name: str, count: int, seed: int) -> Iterator[dict[str, int]]:
     for episode in range(count):
         env = environment(name, seed + 1 + episode)
         timestep = env.reset()
-        first, harvest, tags, steps = stock(timestep.observation).sum(), 0.0, 0, 0
+        first = stock(timestep.observation).sum()
+        harvest = 0.0
+        tags = steps = 0
         while not timestep.last():
-            timestep = env.step(words(rng.integers(8, size=PLAYERS)))
+            timestep = env.step(environment_actions(rng.integers(8, size=PLAYERS)))
             harvest += sum(timestep.observation[f"{player + 1}.REWARD"] for player in range(PLAYERS))
             tags += len({hit for _, hit in zaps(env)})
             steps += 1
@@ -97,8 +104,8 @@ OURS = (7, 0, 1, 2, 3, 4, 5, 6)
 
 
 def trace(name: str, seed: int, *, growth: bool, frames: int = 300) -> dict[str, list[Any]]:
-    """Random play in which an apple grows wherever it can, or never: states, actions, rewards, zaps, and the
-    frames in which players may be in each other's way or come back."""
+    """Return random play in which an apple grows wherever it can, or never: states, actions, rewards, zaps,
+    and the frames in which players may be in each other's way or come back."""
 
     def certain(settings: Any) -> None:
         for part in settings["simulation"]["prefabs"]["apple"]["components"]:
@@ -120,16 +127,18 @@ def trace(name: str, seed: int, *, growth: bool, frames: int = 300) -> dict[str,
             if row < len(board) and col < len(board[0]):  # players out of play walk over the edge
                 held["hidden"][-1][row, col] = True
 
-    def wanted(actions: Any) -> list[tuple[int, int]]:
-        """The cell that each player wants, if no wall is there."""
+    def next_cells(actions: Any) -> list[tuple[int, int]]:
+        """Return the cell that each player wants, if no wall is there."""
         cells = []
         for player, action in enumerate(actions):
-            row, col = held["row"][-1][player], held["col"][-1][player]
+            row = held["row"][-1][player]
+            col = held["col"][-1][player]
             if MOVES[action] > 0:
                 down, right = STEPS[(held["heading"][-1][player] + MOVES[action] - 1) % 4]
                 inside = 0 <= row + down < len(board) and 0 <= col + right < len(board[0])
                 if inside and board[row + down][col + right] != "W":
-                    row, col = row + down, col + right
+                    row += down
+                    col += right
             cells.append((row, col))
         return cells
 
@@ -138,12 +147,11 @@ def trace(name: str, seed: int, *, growth: bool, frames: int = 300) -> dict[str,
     hold(env.reset().observation)
     for _ in range(frames):
         actions = rng.choice(8, size=PLAYERS, p=(0.05, 0.35, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1))
-        cells, before = wanted(actions), list(zip(held["row"][-1], held["col"][-1], strict=True))
-        held["is_contested"].append(
-            len({*cells}) < PLAYERS
-            or any(cell != own and cell in before for cell, own in zip(cells, before, strict=True))
-        )
-        timestep = env.step(words(actions))
+        cells = next_cells(actions)
+        before = list(zip(held["row"][-1], held["col"][-1], strict=True))
+        enters = [cell != start and cell in before for cell, start in zip(cells, before, strict=True)]
+        held["is_contested"].append(len({*cells}) < PLAYERS or any(enters))
+        timestep = env.step(environment_actions(actions))
         held["actions"].append([OURS[action] for action in actions])
         held["reward"].append(
             [float(timestep.observation[f"{player + 1}.REWARD"]) for player in range(PLAYERS)]
@@ -163,12 +171,12 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--trace", choices=("growth", "none"))
     parser.add_argument("--out", type=Path, required=True)
-    words_given = parser.parse_args()
-    if words_given.trace:
-        held = trace(words_given.name, words_given.seed, growth=words_given.trace == "growth")
-        np.savez_compressed(words_given.out, **held)
+    options = parser.parse_args()
+    if options.trace:
+        held = trace(options.name, options.seed, growth=options.trace == "growth")
+        np.savez_compressed(options.out, **held)
         sys.exit()
-    rows = list(episodes(words_given.name, words_given.episodes, words_given.seed))
-    table = {measure: [row[measure] for row in rows] for measure in rows[0]}
-    words_given.out.write_text(json.dumps(table) + "\n")
+    rows = list(episodes(options.name, options.episodes, options.seed))
+    table = {measure: list(map(itemgetter(measure), rows)) for measure in rows[0]}
+    options.out.write_text(json.dumps(table) + "\n")
     print({measure: np.mean(values).round(2) for measure, values in table.items()})

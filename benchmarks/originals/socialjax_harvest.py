@@ -4,7 +4,8 @@
 
 It runs where SocialJax does, on the CPU; of `cprl` it needs nothing. Each of the seven agents draws one of
 the eight actions in every step. With `--walls` its board stands in a ring of walls, so that no beam reaches
-over an edge. With `--trace` it writes 200 steps on that board, without growth, for `tests/test_games.py`.
+over an edge. With `--trace` it writes 200 steps on that board, without growth, for
+`tests/commons/test_games.py`.
 """
 
 import argparse
@@ -20,7 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 from socialjax.environments.common_harvest.harvest_open import Harvest_open, Items
 
-AGENTS, STEPS, ACTIONS = 7, 1000, 8
+AGENTS = 7
+STEPS = 1000
+ACTIONS = 8
 
 
 def environment(*, walls: bool) -> Harvest_open:
@@ -56,19 +59,21 @@ def play(episodes: int, seed: int, *, walls: bool = False) -> dict[str, list[int
     return table | {"regrown": regrown.tolist(), "steps": [STEPS] * episodes}
 
 
-TO_EAST, TO_WEST, TO_SOUTH, TO_NORTH = 2, 3, 4, 5
-DIRECTIONS = {TO_NORTH: 0, TO_EAST: 1, TO_SOUTH: 2, TO_WEST: 3}
-"""Moves do not depend on the heading."""
-WALKS, OTHERS = (0, 3, 1, 2), {0: 4, 1: 5, 6: 7, 7: 6}
-"""The action of cprl for a move by right turns from the heading, and for each of the others."""
+DIRECTIONS = {5: 0, 2: 1, 4: 2, 3: 3}
+"""The heading of each move, to the north, east, south and west; moves do not depend on that of the agent."""
+WALKS = (0, 3, 1, 2)
+"""The action of cprl for a move, by right turns from the heading."""
+OTHERS = {0: 4, 1: 5, 6: 7, 7: 6}
+"""The action of cprl for each of the others."""
 STEPS_TO = ((-1, 0), (0, 1), (1, 0), (0, -1))
 
 
 def trace(seed: int, steps: int = 200) -> dict[str, list[Any]]:
-    """Random play without growth: states, actions, rewards, and the steps in which agents may be in each
-    other's way, or in that of a beam."""
+    """Return random play without growth: states, actions, rewards, and the steps in which agents may be in
+    each other's way, or in that of a beam."""
     jax.random.uniform = lambda key, shape: jnp.full(shape, 0.9)
-    env, rng = environment(walls=True), np.random.default_rng(seed)
+    env = environment(walls=True)
+    rng = np.random.default_rng(seed)
     key = jax.random.PRNGKey(seed)
     _, state = env.reset(key)
     held: dict[str, list[Any]] = defaultdict(list)
@@ -83,23 +88,23 @@ def trace(seed: int, steps: int = 200) -> dict[str, list[Any]]:
     hold()
     for turn in range(steps):
         drawn = rng.choice(8, size=AGENTS, p=(0.1, 0.1, 0.17, 0.17, 0.17, 0.17, 0.04, 0.08))
-        grid, actions, cells = np.asarray(state.grid), [], []
+        grid = np.asarray(state.grid)
+        actions = []
+        cells = []
         before = list(zip(held["row"][-1].tolist(), held["col"][-1].tolist(), strict=True))
         for (row, col), heading, action in zip(before, held["heading"][-1], map(int, drawn), strict=True):
             if action in DIRECTIONS:
                 down, right = STEPS_TO[DIRECTIONS[action]]
                 actions.append(WALKS[(DIRECTIONS[action] - heading) % 4])
                 is_wall = grid[row + down + 1, col + right + 1] == Items.wall
-                cells.append((row, col) if is_wall else (row + down, col + right))
+                cell = (row, col) if is_wall else (row + down, col + right)
+                cells.append(cell)
             else:
                 actions.append(OTHERS[action])
                 cells.append((row, col))
         beams = any(grid[row + 1, col + 1] == Items.interact for row, col in cells)
-        held["is_contested"].append(
-            beams
-            or len({*cells}) < AGENTS
-            or any(cell != own and cell in before for cell, own in zip(cells, before, strict=True))
-        )
+        enters = [cell != start and cell in before for cell, start in zip(cells, before, strict=True)]
+        held["is_contested"].append(beams or len({*cells}) < AGENTS or any(enters))
         _, state, rewards, _, _ = env.step_env(jax.random.fold_in(key, turn), state, jnp.asarray(drawn))
         held["actions"].append(actions)
         held["reward"].append(np.asarray(rewards) / AGENTS)
@@ -114,10 +119,10 @@ if __name__ == "__main__":
     parser.add_argument("--walls", action="store_true")
     parser.add_argument("--trace", action="store_true")
     parser.add_argument("--out", type=Path, required=True)
-    words = parser.parse_args()
-    if words.trace:
-        np.savez_compressed(words.out, **trace(words.seed))
+    options = parser.parse_args()
+    if options.trace:
+        np.savez_compressed(options.out, **trace(options.seed))
         sys.exit()
-    table = play(words.episodes, words.seed, walls=words.walls)
-    words.out.write_text(json.dumps(table) + "\n")
+    table = play(options.episodes, options.seed, walls=options.walls)
+    options.out.write_text(json.dumps(table) + "\n")
     print({measure: float(np.mean(values).round(2)) for measure, values in table.items()})

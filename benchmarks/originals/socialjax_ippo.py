@@ -24,9 +24,11 @@ from typing import Any
 
 from cprl.runs.schedule import Schedule
 
-WORLDS, AGENTS, TURNS = 256, 7, 8
+WORLDS = 256
+AGENTS = 7
+TURNS = 8
 MINIBATCHES = 500
-"""Of a rollout of 1,000 turns."""
+"""The minibatches of a rollout of 1,000 turns."""
 
 
 def write_out_loops(jax: Any, shorter_than: int) -> None:
@@ -45,8 +47,8 @@ def write_out_loops(jax: Any, shorter_than: int) -> None:
     jax.lax.scan = written_out
 
 
-def of_socialjax() -> Iterator[float]:
-    """The rates of first updates, with the start of worlds and network."""
+def socialjax_rates() -> Iterator[float]:
+    """Yield the rates of first updates, with the start of worlds and network."""
     os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
     os.environ["JAX_PLATFORMS"] = "cpu"
     for name in ("wandb", "hydra"):  # not needed
@@ -59,18 +61,18 @@ def of_socialjax() -> Iterator[float]:
     ppo = {"LR": 5e-4, "GAMMA": 0.99, "GAE_LAMBDA": 0.95, "CLIP_EPS": 0.2, "ENT_COEF": 0.01, "VF_COEF": 0.5}
     ppo |= {"MAX_GRAD_NORM": 0.5, "REW_SHAPING_HORIZON": 2.5e6, "SHAPING_BEGIN": 1e6, "UPDATE_EPOCHS": 2}
     sizes = {"NUM_ENVS": WORLDS, "NUM_STEPS": TURNS, "NUM_MINIBATCHES": MINIBATCHES * TURNS // 1000}
-    words = {"ACTIVATION": "relu", "ANNEAL_LR": True, "PARAMETER_SHARING": True}
+    network = {"ACTIVATION": "relu", "ANNEAL_LR": True, "PARAMETER_SHARING": True}
     names = {"ENV_NAME": "harvest_common_open", "ENV_KWARGS": game, "TOTAL_TIMESTEPS": TURNS * WORLDS}
     write_out_loops(jax, TURNS)
     key = jax.random.PRNGKey(0)
-    train = jax.jit(make_train(ppo | sizes | words | names)).lower(key).compile()
+    train = jax.jit(make_train(ppo | sizes | network | names)).lower(key).compile()
     while True:
         began = time.process_time()
         jax.block_until_ready(train(key))
         yield TURNS * WORLDS / (time.process_time() - began)
 
 
-def of_cprl(network: str) -> Iterator[float]:
+def cprl_rates(network: str) -> Iterator[float]:
     from cprl import CommonsEnv, presets
     from cprl.algorithms import IPPO, RolloutSettings
     from cprl.networks import MLP, Conv
@@ -104,8 +106,8 @@ if __name__ == "__main__":
     parser.add_argument("--of", choices=("socialjax", "cprl"), default="socialjax")
     parser.add_argument("--network", choices=("conv", "mlp"), default="conv")
     parser.add_argument("--rounds", type=int, default=3)
-    words = parser.parse_args()
-    rates = of_socialjax() if words.of == "socialjax" else of_cprl(words.network)
-    found = [next(rates) for _ in range(words.rounds)]
-    each = ", ".join(f"{rate:,.1f}" for rate in found)
-    print(f"{median(found):,.1f} env steps/s, {AGENTS * median(found):,.1f} agent steps/s ({each})")
+    options = parser.parse_args()
+    rates = socialjax_rates() if options.of == "socialjax" else cprl_rates(options.network)
+    first = [next(rates) for _ in range(options.rounds)]
+    each = ", ".join(f"{rate:,.1f}" for rate in first)
+    print(f"{median(first):,.1f} env steps/s, {AGENTS * median(first):,.1f} agent steps/s ({each})")

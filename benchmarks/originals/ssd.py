@@ -5,7 +5,7 @@
 It needs numpy and that program's source alone, which draws from numpy's global generator: of Ray, Gym and
 Matplotlib, which the source imports, random play uses nothing, so stand-ins take their places. Each of the
 five agents draws one of the actions in every step. With `--trace` it writes 200 steps with growth by no
-chance for `tests/test_games.py`.
+chance for `tests/commons/test_games.py`.
 """
 
 import argparse
@@ -14,13 +14,15 @@ import json
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
+from operator import itemgetter
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
 
-AGENTS, STEPS = 5, 1000
+AGENTS = 5
+STEPS = 1000
 
 
 class _Base:
@@ -41,7 +43,7 @@ def environment(name: str, agents: int = AGENTS) -> Any:
 
 
 def hits(env: Any) -> set[str]:
-    """The agents that a fining beam of the last step covers."""
+    """Return the agents that a fining beam of the last step covers."""
     covered = {(row, col) for row, col, sign in env.beam_pos if sign == b"F"}
     return {name for name, agent in env.agents.items() if tuple(agent.pos) in covered}
 
@@ -80,12 +82,13 @@ HEADINGS = {"UP": 0, "RIGHT": 1, "DOWN": 2, "LEFT": 3}
 
 
 def trace(name: str, seed: int, *, steps: int = 200, growth: bool) -> dict[str, list[Any]]:
-    """Random play in which an apple grows wherever it can, or no apple and no waste ever comes: states,
-    actions, rewards, and the turns in which agents may be in each other's way."""
+    """Return random play in which an apple grows wherever it can, or no apple and no waste ever comes:
+    states, actions, rewards, and the turns in which agents may be in each other's way."""
     np.random.seed(seed)  # noqa: NPY002
     rng = np.random.default_rng(seed)
     env = environment(name)
-    sys.modules[f"social_dilemmas.envs.{name}"].rand = lambda count: np.full(count, 0.0 if growth else 1.0)
+    draw = 0.0 if growth else 1.0
+    sys.modules[f"social_dilemmas.envs.{name}"].rand = lambda count: np.full(count, draw)
     env.reset()
     agents = list(env.agents.values())
 
@@ -100,23 +103,21 @@ def trace(name: str, seed: int, *, steps: int = 200, growth: bool) -> dict[str, 
 
     hold()
     for _ in range(steps):
-        chances = (0.1, 0.1, 0.3, 0.1, 0.05, 0.1, 0.1, 0.15)
+        probs = (0.1, 0.1, 0.3, 0.1, 0.05, 0.1, 0.1, 0.15)
         if name == "cleanup":
-            chances = (0.15, 0.1, 0.25, 0.1, 0.05, 0.1, 0.1, 0.05, 0.1)
-        actions = rng.choice(len(chances), size=AGENTS, p=chances)
+            probs = (0.15, 0.1, 0.25, 0.1, 0.05, 0.1, 0.1, 0.05, 0.1)
+        actions = rng.choice(len(probs), size=AGENTS, p=probs)
         before = [tuple(agent.pos) for agent in agents]
-        wanted = [
-            tuple(agent.return_valid_pos(agent.pos + env.rotate_action(move, agent.get_orientation())))
-            if len(np.shape(move := env.all_actions[agent.action_map(action)])) == 1
-            else tuple(agent.pos)
-            for agent, action in zip(agents, actions, strict=True)
-        ]
+        cells = list(before)
+        for place, (agent, action) in enumerate(zip(agents, actions, strict=True)):
+            move = env.all_actions[agent.action_map(action)]
+            if len(np.shape(move)) == 1:
+                step = env.rotate_action(move, agent.get_orientation())
+                cells[place] = tuple(agent.return_valid_pos(agent.pos + step))
         _, rewards, _, _ = env.step(dict(zip(env.agents, map(int, actions), strict=True)))
         held["actions"].append([OURS[int(action)] for action in actions])
-        held["is_contested"].append(
-            len({*wanted}) < AGENTS
-            or any(cell != own and cell in before for cell, own in zip(wanted, before, strict=True))
-        )
+        enters = [cell != start and cell in before for cell, start in zip(cells, before, strict=True)]
+        held["is_contested"].append(len({*cells}) < AGENTS or any(enters))
         held["reward"].append([rewards[name] for name in env.agents])
         hold()
     return held
@@ -129,11 +130,13 @@ if __name__ == "__main__":
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--trace", choices=("growth", "none"))
     parser.add_argument("--out", type=Path, required=True)
-    words = parser.parse_args()
-    if words.trace:
-        np.savez_compressed(words.out, **trace(words.name, words.seed, growth=words.trace == "growth"))
+    options = parser.parse_args()
+    if options.trace:
+        np.savez_compressed(
+            options.out, **trace(options.name, options.seed, growth=options.trace == "growth")
+        )
         sys.exit()
-    rows = list(episodes(words.name, words.episodes, words.seed))
-    table = {measure: [row[measure] for row in rows] for measure in rows[0]}
-    words.out.write_text(json.dumps(table) + "\n")
+    rows = list(episodes(options.name, options.episodes, options.seed))
+    table = {measure: list(map(itemgetter(measure), rows)) for measure in rows[0]}
+    options.out.write_text(json.dumps(table) + "\n")
     print({measure: float(np.mean(values).round(2)) for measure, values in table.items()})

@@ -16,8 +16,7 @@ import yaml
 from website.navigation import sections
 from website.pages import ROOT, stage_pages
 from website.reference import stage_reference
-from website.replays import PAGE as REPLAYS
-from website.replays import VIEWER, copy_viewer, stage_replays
+from website.replays import PAGE as REPLAYS, VIEWER, copy_viewer, stage_replays
 
 HERE: Final = Path(__file__).parent
 SITE: Final = ROOT / "build" / "site"
@@ -25,7 +24,7 @@ STAGED: Final = ROOT / "build" / "docs"
 
 
 def main() -> None:
-    """Stages the pages and builds the site, with warnings as errors."""
+    """Stage the pages and build the site, with warnings as errors."""
     pages = STAGED / "pages"
     shutil.rmtree(STAGED, ignore_errors=True)
     pages.mkdir(parents=True)
@@ -43,7 +42,7 @@ def main() -> None:
 
 
 def _navigation(reference: dict[str, str]) -> list[Any]:
-    """The pages by section, as MkDocs wants them."""
+    """Return the pages by section, as MkDocs wants them."""
     found: list[Any] = [{"Home": "index.md"}]
     for section, pages in sections().items():
         if section == "Study":
@@ -59,7 +58,7 @@ def _section(title: str, pages: Mapping[str, str]) -> dict[str, list[dict[str, s
 
 
 def _config(pages: Path, navigation: list[Any]) -> str:
-    """mkdocs.yml with what depends on this checkout; JSON is YAML."""
+    """Return mkdocs.yml with what depends on this checkout; JSON is YAML."""
     text = (HERE / "mkdocs.yml").read_text(encoding="utf-8")
     text = text.replace("        python:\n", f"        python:\n          paths: ['{ROOT / 'src'}']\n")
     more = {"docs_dir": str(pages), "site_dir": str(SITE), "nav": navigation}
@@ -67,7 +66,7 @@ def _config(pages: Path, navigation: list[Any]) -> str:
 
 
 def _build(config: Path) -> None:
-    """Runs MkDocs, and ends with its exit code where it fails.
+    """Run MkDocs, and end with its exit code where it fails.
 
     Material's banner about its own end, of which `website` says more, is left out.
     """

@@ -10,7 +10,7 @@ _ROW: Final = re.compile(r"^\| \[([^\]]+)\]\(([\w./-]+\.md)\) \|", re.MULTILINE)
 
 
 def sections() -> dict[str, dict[str, str]]:
-    """The pages that the index lists: by heading, the title of each page and its file beside the index."""
+    """Return the pages that the index lists: by heading, the title and the file of each."""
     text = INDEX.read_text(encoding="utf-8")
     parts = re.split(r"^## (.*)$", text, flags=re.MULTILINE)
     found = zip(parts[1::2], parts[2::2], strict=True)

@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import quote
 
-from website.replays import PAGE as REPLAYS
-from website.replays import recordings
+from website.replays import PAGE as REPLAYS, SUFFIX, recordings
 
 ROOT: Final = Path(__file__).parents[2]
 DOCS: Final = ROOT / "docs"
@@ -38,7 +37,7 @@ _LIST_AFTER_TEXT: Final = re.compile(r"^((?![-*#>|\s]|\d+\. ).+\n)(?=(?:[-*]|\d+
 
 
 def stage_pages(folder: Path) -> None:
-    """Writes docs/*.md, and all that they lead to, into a folder, with links that lead to each other there.
+    """Write docs/*.md, and all that they lead to, into a folder, with links that lead to each other there.
 
     Raises:
         ValueError: if a page links to something that is not there.
@@ -54,7 +53,7 @@ def stage_pages(folder: Path) -> None:
 
 
 def place(path: Path) -> str:
-    """Where a file or folder of the repository stands among the staged pages; of a recording with a query."""
+    """Return where a file or folder of the repository stands among the staged pages."""
     inside = path.is_relative_to(DOCS)
     name = path.relative_to(DOCS).as_posix() if inside else f"repository/{path.relative_to(ROOT).as_posix()}"
     if path.is_dir():
@@ -63,14 +62,14 @@ def place(path: Path) -> str:
         return f"{name.removesuffix(path.name)}about.md"
     if path.suffix == ".md" or path.suffix in COPIED:
         return name
-    if path.suffix == ".rrd":
+    if path.name.endswith(SUFFIX):
         names = {own: replay for replay, own in recordings().items()}
         return f"{REPLAYS}?replay={quote(names[path])}"
     return f"{name}.md" if path.suffix in LANGUAGES else place(path.parent)
 
 
 def _stage(path: Path, folder: Path) -> list[Path]:
-    """Writes one of them; what it links to."""
+    """Write one of them, and return what it links to."""
     target = folder / place(path)
     target.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix in COPIED:
@@ -87,10 +86,11 @@ def _stage(path: Path, folder: Path) -> list[Path]:
 
 
 def _markdown(path: Path, found: Callable[[Path], None]) -> str:
-    """A page with its links rewritten."""
+    """Return a page with its links rewritten."""
 
     def rewritten(match: re.Match[str]) -> str:
-        target, heading = match[1], match[2] or ""
+        target = match[1]
+        heading = match[2] or ""
         if re.match(r"[a-z]+:", target):
             return match[0]
         led = Path(os.path.normpath(path.parent / target))
@@ -104,7 +104,7 @@ def _markdown(path: Path, found: Callable[[Path], None]) -> str:
 
 
 def _link(origin: Path, target: Path, found: Callable[[Path], None]) -> str:
-    """The link from the page of one to the page of the other, which is noted."""
+    """Return the link from the page of one to the page of the other, which is noted."""
     there = place(target)
     if there.partition("?")[0] != REPLAYS:
         found(target if place(target) != place(target.parent) else target.parent)
@@ -112,7 +112,7 @@ def _link(origin: Path, target: Path, found: Callable[[Path], None]) -> str:
 
 
 def _source_page(path: Path) -> str:
-    """A file of text as a page, which the search leaves out."""
+    """Return a file of text as a page, which the search leaves out."""
     text = path.read_text(encoding="utf-8").rstrip("\n")
     fence = "`" * max(3, *(len(run) + 1 for run in re.findall("`{3,}", text)), 3)
     name = path.relative_to(ROOT).as_posix()
@@ -120,13 +120,13 @@ def _source_page(path: Path) -> str:
 
 
 def _folder_page(path: Path, found: Callable[[Path], None]) -> str:
-    """A folder as a list of what it holds."""
+    """Return a folder as a list of what it holds."""
     lines = [f"{_UNSEARCHED}# {path.relative_to(ROOT).as_posix()}\n"]
     for own in sorted(path.iterdir(), key=lambda one: (one.is_file(), one.name)):
         if own.name.startswith((".", "__pycache__")):
             continue
         name = f"`{own.name}{'/' * own.is_dir()}`"
-        is_page = own.is_dir() or own.suffix in {".md", ".rrd", *LANGUAGES}
+        is_page = own.is_dir() or own.suffix in {".md", *LANGUAGES} or own.name.endswith(SUFFIX)
         lines.append(f"- [{name}]({_link(path / 'index.md', own, found)})" if is_page else f"- {name}")
     return "\n".join(lines) + "\n"
 

@@ -42,10 +42,14 @@ _MODULES: Final = {
     "commons": ("maps", "published", "observation", "rules", "game", "spaces", "state"),
     "envs": ("make_env",),
     "experiment": ("presets",),
+    "experimental": (
+        *("schelling", "territory", "payoff_table", "solutions", "empirical_game", "exploit", "search"),
+        "ray_executor",
+    ),
     "learners": ("settings",),
     "measuring": ("social", "registry", "table", "statistics", "outcome"),
     "objectives": ("rewards",),
-    "policies": ("scripted", "assignment", "decisions"),
+    "policies": ("scripted", "joint_policy", "decisions"),
     "training": ("training",),
     "values": ("custom",),
     "viewer": ("callback",),
@@ -57,7 +61,7 @@ INTERNAL: Final = {"system", "recurrent_state", "pictures", "runs", "terminal", 
 
 
 def stage_reference(folder: Path) -> dict[str, str]:
-    """Writes the pages; the title and the file of each."""
+    """Write the pages, and return the title and the file of each."""
     (folder / FOLDER).mkdir(parents=True, exist_ok=True)
     pages = {"API": f"{FOLDER}/api.md", "Commands": f"{FOLDER}/commands.md"}
     (folder / pages["API"]).write_text(_landing_page(), encoding="utf-8")
@@ -70,7 +74,7 @@ def stage_reference(folder: Path) -> dict[str, str]:
 
 
 def _landing_page() -> str:
-    """The values that a user writes, and all packages with what they are about."""
+    """Return the values that a user writes, and all packages with what they are about."""
     text = f"# API\n\n{_LANDING}\n\n## All packages\n\n| package | what it is about |\n|---|---|\n"
     for name, about in REFERENCE.items():
         package = name if name == "cprl" else f"cprl.{name}"
@@ -96,7 +100,7 @@ They are frozen: `dataclasses.replace` makes a changed copy.
 
 
 def _package_page(package: str) -> str:
-    """What a package says of itself, and an entry for each public name, which mkdocstrings fills."""
+    """Return what a package says of itself, and an entry for each public name, which mkdocstrings fills."""
     module = import_module(package)
     said, modules = _split(module.__doc__ or "")
     text = f"# {package}\n\n{said}\n"
@@ -106,7 +110,7 @@ def _package_page(package: str) -> str:
 
 
 def _public_names(package: str) -> list[str]:
-    """The full names of what a package exports, of a module what it defines; then those of its modules."""
+    """Return the full names of what a package exports or a module defines; then those of its modules."""
     module = import_module(package)
     exported = list(getattr(module, "__all__", ()))
     found = [
@@ -131,12 +135,12 @@ def _defined_by(module: Any) -> list[str]:
 
 
 def _is_elsewhere(module: Any, name: str) -> bool:
-    """Whether another page shows this, as of the modules that `cprl` exports; or there is nothing to show."""
+    """Return whether another page shows this, as of the modules that `cprl` exports, or none can."""
     return name.startswith("__") or isinstance(getattr(module, name), ModuleType)
 
 
 def _path_of(package: str, name: str) -> str:
-    """The full name; where a module has the same name, as of `cprl.envs.make_env`, that of its definition."""
+    """Return the full name; that of its definition where a module has the same name, as `make_env`."""
     module = import_module(package)
     if hasattr(module, "__path__") and find_spec(f"{package}.{name}"):
         value = getattr(module, name)
@@ -145,7 +149,7 @@ def _path_of(package: str, name: str) -> str:
 
 
 def _split(doc: str) -> tuple[str, str]:
-    """The text of a package's docstring, and the list of modules in it, which is indented."""
+    """Return the text of a package's docstring, and the list of modules in it, which is indented."""
     lines = doc.strip().splitlines()
     listed = [line.removeprefix("    ") for line in lines if line.startswith("    ")]
     text = [line for line in lines if not line.startswith("    ") and not line.endswith(":")]
@@ -163,7 +167,7 @@ def _commands_page() -> str:
 
 
 def help_of(*words: str) -> str:
-    """What `cprl WORDS --help` prints, as a block of text."""
+    """Return what `cprl WORDS --help` prints, as a block of text."""
     from cprl.commands import main as cli
 
     out = io.StringIO()
@@ -180,5 +184,5 @@ def help_of(*words: str) -> str:
 
 
 def packages_there() -> set[str]:
-    """The packages and modules right below `cprl`."""
+    """Return the packages and modules right below `cprl`."""
     return {found.name for found in iter_modules(import_module("cprl").__path__)}

@@ -1,5 +1,6 @@
 """The recordings of docs/results, and the page that plays them in Rerun's web viewer, that of rerun-sdk."""
 
+import gzip
 import shutil
 import time
 from functools import cache
@@ -15,6 +16,7 @@ from cprl.viewer.page import LOCALHOST, WebViewer
 RESULTS: Final = Path(__file__).parents[1] / "results"
 BOARDS: Final = RESULTS.with_name("boards")
 """Pictures of the boards by their names, which runs have, too."""
+SUFFIX: Final = ".rrd.gz"
 PAGE: Final = "replays.md"
 FOLDER: Final = "recordings"
 VIEWER: Final = "viewer"
@@ -27,21 +29,21 @@ _TEMPLATE: Final = Path(__file__).parent / "replays.md"
 
 @cache
 def recordings() -> dict[str, Path]:
-    """The committed replays by name: the run, and the file where a run has several."""
-    files = sorted(RESULTS.rglob("replay*.rrd"))
+    """Return the committed replays by name: the run, and the file where a run has several."""
+    files = sorted(RESULTS.rglob(f"replay*{SUFFIX}"))
     runs = [path.parent.relative_to(RESULTS).as_posix() for path in files]
     return {
-        run if runs.count(run) == 1 else f"{run}/{path.stem}": path
+        run if runs.count(run) == 1 else f"{run}/{path.name.removesuffix(SUFFIX)}": path
         for run, path in zip(runs, files, strict=True)
     }
 
 
 def stage_replays(folder: Path) -> None:
-    """Writes the page and copies the recordings."""
+    """Write the page, and unpack the recordings."""
     for name, path in recordings().items():
         target = folder / FOLDER / f"{name}.rrd"
         target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(path, target)
+        target.write_bytes(gzip.decompress(path.read_bytes()))
     (folder / BOARDS.name).mkdir(exist_ok=True)
     links = ""
     for name in recordings():
@@ -57,7 +59,7 @@ def stage_replays(folder: Path) -> None:
 
 
 def copy_viewer(folder: Path) -> None:
-    """Writes the web viewer of the installed rerun-sdk, 43 MB, beside the pages; Rerun's command has it built
+    """Write the web viewer of the installed rerun-sdk, 43 MB, beside the pages; Rerun's command has it built
     in, and only hands it out as a server."""
     folder.mkdir(parents=True, exist_ok=True)
     server = WebViewer()
@@ -69,8 +71,9 @@ def copy_viewer(folder: Path) -> None:
 
 
 def _fetched(address: str) -> bytes:
-    """What a server answers that may just have been started."""
-    opener, ends = build_opener(ProxyHandler({})), time.monotonic() + START_S
+    """Return what a server answers that may just have been started."""
+    opener = build_opener(ProxyHandler({}))
+    ends = time.monotonic() + START_S
     while True:
         try:
             with opener.open(address, timeout=START_S) as answer:

@@ -26,7 +26,8 @@ class CommonsTask(VmasClass):
     def get_env_transforms(self, env: EnvBase) -> list[transforms.Transform]:
         key = [keys.OBSERVATION]
         cast = transforms.DTypeCastTransform(torch.uint8, torch.float32, in_keys=key)
-        flat, scaled = FlattenObservation(-3, -1, in_keys=key), ObservationNorm(0.0, 1 / 255, in_keys=key)
+        flat = FlattenObservation(-3, -1, in_keys=key)
+        scaled = ObservationNorm(0.0, 1 / 255, in_keys=key)
         return [transforms.SelectTransform(*key), cast, flat, scaled]
 
     def max_steps(self, env: EnvBase) -> int:
@@ -40,13 +41,14 @@ class CommonsTask(VmasClass):
 
 
 def main(*, iterations: int = 20, worlds: int = 16, seed: int = 0, out: str = ".") -> float:
-    """Trains on an episode in every world per iteration; returns the last harvest of an agent."""
-    task, stock = CommonsTask("commons", {}), ExperimentConfig.get_from_yaml()
+    """Train on an episode in every world per iteration; return the last harvest of an agent."""
+    task = CommonsTask("commons", {})
+    stock = ExperimentConfig.get_from_yaml()
     frames = worlds * presets.game(task.name).rules.episode_steps
-    own = {"max_n_iters": iterations, "max_n_frames": None, "lr": 1e-3, "evaluation": False}
+    length = {"max_n_iters": iterations, "max_n_frames": None, "lr": 1e-3, "evaluation": False}
     rows = {"on_policy_minibatch_size": frames // 16, "on_policy_n_minibatch_iters": 4}
     turns = {"on_policy_collected_frames_per_batch": frames, "on_policy_n_envs_per_worker": worlds}
-    config = replace(stock, save_folder=out, loggers=["csv"], create_json=False, **own, **rows, **turns)
+    config = replace(stock, save_folder=out, loggers=["csv"], create_json=False, **length, **rows, **turns)
     experiment = Experiment(task, IppoConfig.get_from_yaml(), MlpConfig.get_from_yaml(), seed, config)
     experiment.run()
     return experiment.mean_return

@@ -12,19 +12,21 @@ from cprl import CommonsEnv, keys, presets
 
 
 def play(network: nn.Module, windows: Tensor) -> tuple[Categorical, Tensor]:
-    """Policy and value for windows, uint8 [..., C, X, Y]."""
+    """Return policy and value for windows, uint8 [..., C, X, Y]."""
     heads = network(windows.flatten(-3) / 255)
     return Categorical(logits=heads[..., :-1]), heads[..., -1]
 
 
 def main(*, iterations: int = 20, worlds: int = 16, seed: int = 0) -> list[float]:
-    """Trains on an episode in every world per iteration; returns the harvest of an agent in each."""
+    """Train on an episode in every world per iteration; return the harvest of an agent in each."""
     torch.manual_seed(seed)
     game = presets.game("commons")
     env = TransformedEnv(CommonsEnv(game, worlds, seed=seed), RewardSum([keys.REWARD], ["return"]))
-    sizes = prod(game.observation_shape), len(game.actions) + 1
-    layers = nn.Linear(sizes[0], 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, sizes[1])
-    network, now, harvests = nn.Sequential(*layers), env.reset(), []
+    first = nn.Linear(prod(game.observation_shape), 64)
+    last = nn.Linear(64, len(game.actions) + 1)
+    network = nn.Sequential(first, nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), last)
+    now = env.reset()
+    harvests = []
     adam = torch.optim.Adam(network.parameters(), lr=1e-3)
     for iteration in range(iterations):
         turns = []
@@ -38,14 +40,17 @@ def main(*, iterations: int = 20, worlds: int = 16, seed: int = 0) -> list[float
             agents, later = (torch.stack(turns)[part] for part in ("agents", "next"))  # [T, B, N], [T, B]
             after = play(network, later[keys.OBSERVATION])[1] * ~later["terminated"]
             surprise = later[keys.REWARD].squeeze(-1) + 0.99 * after - agents["value"]
-            advantage, ahead = torch.zeros_like(surprise), 0  # bootstrapped where the clock ended an episode
+            advantage = torch.zeros_like(surprise)
+            ahead = 0  # bootstrapped where the clock ended an episode
             for t in reversed(range(len(turns))):
                 advantage[t] = ahead = surprise[t] + 0.99 * 0.95 * ahead * ~later["done"][t]
-            agents["advantage"], agents["target"] = advantage, advantage + agents["value"]
+            agents["advantage"] = advantage
+            agents["target"] = advantage + agents["value"]
         for rows in [rows for _ in range(4) for rows in torch.randperm(agents.numel()).chunk(16)]:
             part = agents.reshape(-1)[rows]
             policy, value = play(network, part["observation"])
-            ratio, gain = (policy.log_prob(part["action"]) - part["log_prob"]).exp(), part["advantage"]
+            ratio = (policy.log_prob(part["action"]) - part["log_prob"]).exp()
+            gain = part["advantage"]
             gained = torch.min(ratio * gain, ratio.clamp(0.8, 1.2) * gain) + 0.01 * policy.entropy()
             adam.zero_grad()
             (0.5 * (value - part["target"]).square() - gained).mean().backward()

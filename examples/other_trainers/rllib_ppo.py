@@ -34,7 +34,7 @@ class FlatWindows(BaseParallelWrapper):
 
 
 def main(*, iterations: int = 20, worlds: int = 4, runners: int = 0, seed: int = 0) -> list[float]:
-    """Trains on an episode in every world of every runner; returns an agent's harvest in each iteration."""
+    """Train on an episode in every world of every runner; return an agent's harvest in each iteration."""
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to Ray's makers
     ray.init("local", num_cpus=1 + runners, include_dashboard=False, object_store_memory=100_000_000)
     game = presets.game("commons")
@@ -46,7 +46,8 @@ def main(*, iterations: int = 20, worlds: int = 4, runners: int = 0, seed: int =
     ppo.rl_module(model_config=DefaultModelConfig(fcnet_hiddens=[64, 64]))
     ppo.training(train_batch_size_per_learner=frames, minibatch_size=frames // 16, num_epochs=4)
     ppo.training(lr=1e-3, gamma=0.99, lambda_=0.95, entropy_coeff=0.01)
-    trainer, harvests = ppo.build_algo(), []
+    trainer = ppo.build_algo()
+    harvests = []
     for iteration in range(iterations):
         harvests.append(float(trainer.train()["env_runners"]["episode_return_mean"]) / game.agents)
         print(f"iteration {iteration + 1}: an agent harvests {harvests[-1]:.1f} in an episode", flush=True)

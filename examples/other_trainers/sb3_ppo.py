@@ -14,7 +14,7 @@ from cprl.envs import parallel_env
 
 
 class TimeLimits(BaseParallelWrapper):
-    """Marks episodes that the clock ended, which SB3 bootstraps; SuperSuit does not tell them from others."""
+    """A wrapper that marks episodes that the clock ended, which SB3 bootstraps; SuperSuit loses that."""
 
     def step(self, actions: dict[str, int]) -> tuple[Any, ...]:
         observations, rewards, terminated, truncated, infos = super().step(actions)
@@ -24,7 +24,7 @@ class TimeLimits(BaseParallelWrapper):
 
 
 def worlds_of(game: Game, worlds: int, seed: int) -> VecMonitor:
-    """The agents of all worlds, one after the other, as one batch of SB3's."""
+    """Return the agents of all worlds, one after the other, as one batch of SB3's."""
     one = pettingzoo_env_to_vec_env_v1(TimeLimits(parallel_env(game)))
     copies = concat_vec_envs_v1(one, worlds, base_class="stable_baselines3")
     copies.venv.reset(seed=seed * worlds)  # a seed for each copy, or all would play the same world
@@ -32,10 +32,11 @@ def worlds_of(game: Game, worlds: int, seed: int) -> VecMonitor:
 
 
 def main(*, iterations: int = 20, worlds: int = 4, seed: int = 0) -> list[float]:
-    """Trains on an episode in every world per iteration; returns the harvest of an agent in each."""
+    """Train on an episode in every world per iteration; return the harvest of an agent in each."""
     set_random_seed(seed)
     game = presets.game("commons")
-    turns, agents = game.rules.episode_steps, worlds * game.agents
+    turns = game.rules.episode_steps
+    agents = worlds * game.agents
     batches = {
         "n_steps": turns,
         "batch_size": turns * agents // 16,

@@ -13,8 +13,11 @@ from torchrl.objectives import ClipPPOLoss, ValueEstimators
 
 from cprl import CommonsEnv, keys, presets
 
-LOGITS, VALUE, LOG_PROB = ("agents", "logits"), ("agents", "state_value"), ("agents", "log_prob")
-ENDS, RETURN = {"done": ("agents", "done"), "terminated": ("agents", "terminated")}, ("agents", "return")
+LOGITS = ("agents", "logits")
+VALUE = ("agents", "state_value")
+LOG_PROB = ("agents", "log_prob")
+RETURN = ("agents", "return")
+ENDS = {"done": ("agents", "done"), "terminated": ("agents", "terminated")}
 
 
 class OwnMLPs(MultiAgentMLP):
@@ -25,7 +28,7 @@ class OwnMLPs(MultiAgentMLP):
 
 
 def main(*, iterations: int = 20, worlds: int = 16, seed: int = 0) -> list[float]:
-    """Trains on an episode in every world per iteration; returns the harvest of an agent in each."""
+    """Train on an episode in every world per iteration; return the harvest of an agent in each."""
     torch.manual_seed(seed)
     game = presets.game("commons")
     env = TransformedEnv(CommonsEnv(game, worlds, seed=seed), RewardSum([keys.REWARD], [RETURN]))
@@ -37,12 +40,14 @@ def main(*, iterations: int = 20, worlds: int = 16, seed: int = 0) -> list[float
     loss = ClipPPOLoss(actor, value, entropy_coeff=0.01)
     loss.set_keys(action=keys.ACTION, sample_log_prob=LOG_PROB, value=VALUE, reward=keys.REWARD, **ENDS)
     loss.make_value_estimator(ValueEstimators.GAE, gamma=0.99, lmbda=0.95)
-    adam, frames = torch.optim.Adam(loss.parameters(), lr=1e-3), worlds * game.rules.episode_steps
-    harvests, sizes = [], {"frames_per_batch": frames, "total_frames": iterations * frames}
+    adam = torch.optim.Adam(loss.parameters(), lr=1e-3)
+    frames = worlds * game.rules.episode_steps
+    sizes = {"frames_per_batch": frames, "total_frames": iterations * frames}
+    harvests = []
     for batch in Collector(env, actor, **sizes, auto_register_policy_transforms=False):
         later = batch["next"]
-        for of_world, of_agents in ENDS.items():  # [B, T, 1] to [B, T, N, 1], as the rewards are
-            later[of_agents] = later[of_world].unsqueeze(-2).expand(later[keys.REWARD].shape)
+        for end, key in ENDS.items():  # [B, T, 1] to [B, T, N, 1], as the rewards are
+            later[key] = later[end].unsqueeze(-2).expand(later[keys.REWARD].shape)
         with torch.no_grad():
             loss.value_estimator(batch, params=loss.critic_network_params)
         for rows in [rows for _ in range(4) for rows in torch.randperm(frames).chunk(16)]:

@@ -14,7 +14,7 @@ from torchrl.objectives import DistributionalDQNLoss
 import cprl
 from cprl import Game, Rules, maps
 from cprl.algorithms import DQNSettings, OffPolicy
-from cprl.networks.agent import OtherOutputs
+from cprl.networks.agent import MethodModule
 from cprl.population import Learning
 from cprl.values import Range
 
@@ -45,7 +45,7 @@ class C51(OffPolicy):
 
     def make_loss(self, network):
         self.refuse_relu()
-        logits = OtherOutputs(network, "atom_logits")
+        logits = MethodModule(network, "atom_logits")
         support = {"support": network.support, "spec": None, "action_space": "categorical"}
         actor = DistributionalQValueActor(logits, **support)
         return FlatLoss(actor, gamma=self.settings.gamma, delay_value=True)
@@ -69,20 +69,22 @@ class AtomNetwork(nn.Module):
 
     def __init__(self, network, actions, lowest, highest, atoms):
         super().__init__()
-        self.network, self.actions, self.atoms = network, actions, atoms
+        self.network = network
+        self.actions = actions
+        self.atoms = atoms
         self.register_buffer("support", support(lowest, highest, atoms))
 
     def atom_logits(self, observation):
-        """uint8 [..., C, X, Y] to [..., atoms, A], before the softmax over atoms."""
+        """Return [..., atoms, A] of windows, uint8 [..., C, X, Y], before the softmax over atoms."""
         return self.network(observation).unflatten(-1, (self.atoms, self.actions))
 
     def forward(self, observation):
-        """uint8 [..., C, X, Y] to the expected values [..., A]."""
+        """Return the expected values [..., A] of windows, uint8 [..., C, X, Y]."""
         return (self.atom_logits(observation).softmax(-2) * self.support[:, None]).sum(-2)
 
 
 def support(lowest, highest, atoms):
-    """The atoms, float32 [atoms], such that none is projected beyond the last one.
+    """Return the atoms, float32 [atoms], such that none is projected beyond the last one.
 
     `DistributionalDQNLoss` finds the place of a return by dividing its distance to the lowest atom by that
     between atoms. From -5 to 100 the quotient of the highest of 51 is rounded to 50.000004, whose neighbour
@@ -92,7 +94,8 @@ def support(lowest, highest, atoms):
     for lower in range(atoms):  # where atoms - 1 divides the range, in units of `finest`, all is exact
         top = float(np.float32(highest)) - lower * finest if lower else highest
         support = torch.linspace(lowest, top, atoms)
-        low, high = support.min().item(), support.max().item()
+        low = support.min().item()
+        high = support.max().item()
         if (support.max() - low) / ((high - low) / (atoms - 1)) <= atoms - 1:
             break
     return support

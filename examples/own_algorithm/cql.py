@@ -21,7 +21,7 @@ class CQL(OffPolicy):
 
     conservative_weight: Annotated[float, Range(0, 1e6)] = 0.1
     """The weight of the conservative term. TorchRL's weight is 1, for fixed data sets; with it, agents that
-    explore imitate their first random actions (`tests/test_optimum.py`)."""
+    explore imitate their first random actions (`tests/algorithms/test_optimum.py`)."""
     loss_function: str = "l2"
     update = "stacked"  # all agents in one batch; without this line, the fastest way that works is found
 
@@ -46,7 +46,7 @@ class WeightedCQLLoss(DiscreteCQLLoss):
 
 
 def bootstrap_from_target(estimator):
-    """Makes the estimator of a `DiscreteCQLLoss` bootstrap from the target network.
+    """Make the estimator of a `DiscreteCQLLoss` bootstrap from the target network.
 
     The loss passes the target weights as `params`, but its estimator ignores them and would bootstrap from
     the network itself.

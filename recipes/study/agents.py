@@ -3,6 +3,8 @@
 python recipes/study/agents.py --jobs 2
 """
 
+from dataclasses import replace
+
 from base import AGENT, EXPERIMENT
 
 import cprl
@@ -12,26 +14,27 @@ BOARD = EXPERIMENT.game.map
 
 
 def crowded(agents: int) -> Map:
-    """The published board with other agents: the published ones, then those of the board turned by half."""
-    low, right = BOARD.height - 1, BOARD.width - 1
-    turned = tuple((low - row, right - col, (at + 2) % 4) for row, col, at in BOARD.starts)
-    lower = tuple((low - row, col, 0) for row, col, _ in BOARD.starts)
-    starts = (*BOARD.starts, *turned, *lower)
-    return Map(height=BOARD.height, width=BOARD.width, sites=BOARD.sites, starts=starts[:agents])
+    """Return the published board with the published agents, then those of the board turned by half, then
+    those of its mirror image."""
+    low = BOARD.height - 1
+    right = BOARD.width - 1
+    turned = [(low - row, right - col, (heading + 2) % 4) for row, col, heading in BOARD.starts]
+    mirrored = [(low - row, col, 0) for row, col, _ in BOARD.starts]
+    return replace(BOARD, starts=(*BOARD.starts, *turned, *mirrored)[:agents])
 
 
 def in_proportion(agents: int) -> Map:
-    """As many published boards side by side as there are fours of agents; half a board for two."""
+    """Return as many published boards side by side as there are fours of agents, half a board for two."""
     if agents < 4:
         half = BOARD.width // 2
         sites = tuple((row, col) for row, col in BOARD.sites if col < half)
         return Map(height=BOARD.height, width=half, sites=sites, starts=BOARD.starts[:agents])
-    boards = range(agents // 4)
+    lefts = range(0, BOARD.width * agents // 4, BOARD.width)
     return Map(
         height=BOARD.height,
-        width=BOARD.width * len(boards),
-        sites=tuple((row, col + BOARD.width * nth) for nth in boards for row, col in BOARD.sites),
-        starts=tuple((row, col + BOARD.width * nth, at) for nth in boards for row, col, at in BOARD.starts),
+        width=BOARD.width * len(lefts),
+        sites=tuple((row, left + col) for left in lefts for row, col in BOARD.sites),
+        starts=tuple((row, left + col, heading) for left in lefts for row, col, heading in BOARD.starts),
     )
 
 

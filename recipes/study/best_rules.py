@@ -47,11 +47,11 @@ BEST: Final[dict[Rule, tuple[Institution, ...]]] = {
     ),
     "tax": (Tax(rate=0.770762, period_steps=1),),
 }
-"""What the searches found."""
+"""The settings that the searches found."""
 
 
 def experiment(*, rule: Rule = "none") -> cprl.Experiment:
-    """Four DQN agents on `commons` under a rule as it was chosen by hand, or under none.
+    """Return four DQN agents on `commons` under a rule as it was chosen by hand, or under none.
 
     Args:
         rule: which one.
@@ -65,7 +65,7 @@ STUDY = cprl.Study(
     conditions={
         "none": {},
         **{f"{rule}, by hand": {"game.institutions": BY_HAND[rule]} for rule in BEST},
-        **{f"{rule}, best found": {"game.institutions": found} for rule, found in BEST.items()},
+        **{f"{rule}, best found": {"game.institutions": best} for rule, best in BEST.items()},
     },
     replicas=8,
     name="best_rules",

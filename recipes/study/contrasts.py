@@ -9,13 +9,14 @@ agents at its end, whose weights no longer change and who explore half as much. 
 conditions minus that of others, in each replica.
 """
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final, NamedTuple
 
 import numpy as np
 import tyro
 from governs import RESULTS, Part, values_of
-from numpy.typing import NDArray
+from page import table
 from together import design, name
 
 from cprl.measuring.statistics import Estimate, difference, estimate
@@ -43,95 +44,111 @@ class Contrast(NamedTuple):
     label: str
     study: str
     metric: str
-    more: list[str]
-    less: list[str]
+    more: Sequence[str]
+    less: Sequence[str]
     last: int = 30
     """Episodes at the end of the training."""
 
+    def difference(self, part: Part) -> Estimate:
+        """Return the difference of the means over conditions, paired by replica."""
+        means = []
+        for conditions in (self.more, self.less):
+            values = [values_of(self.study, one, self.metric, part, self.last) for one in conditions]
+            means.append(np.mean(values, axis=0))
+        return difference(*means, paired=True)
 
-def with_rule(factor: str, *, metric: str, is_there: bool) -> Contrast:
-    """A factor of together.py in the combinations that have a quota or boundaries, or in the others, where
-    monitoring and sanctions are not in the game."""
+
+TITLES: Final = {
+    "income": "income",
+    "survival_steps": "survival, turns",
+    "income_equality": "equality of income",
+}
+
+
+def with_rule(factor: str, metric: str, *, is_there: bool) -> Contrast:
+    """Return a factor of together.py in the combinations that have a quota or boundaries, or in the others,
+    where monitoring and sanctions are not in the game."""
     cells = [levels for levels in design() if (levels["quota"] or levels["boundaries"]) == is_there]
     where = "where there is a quota or boundaries" if is_there else "where there is neither"
-    return Contrast(
-        label=f"{factor} {where}, {'income' if metric == 'income' else 'survival, turns'}",
-        study="together",
-        metric=metric,
-        more=[name(levels) for levels in cells if levels[factor]],
-        less=[name(levels) for levels in cells if not levels[factor]],
-    )
+    more = [name(levels) for levels in cells if levels[factor]]
+    less = [name(levels) for levels in cells if not levels[factor]]
+    return Contrast(f"{factor} {where}, {TITLES[metric]}", "together", metric, more, less)
 
 
-def contrasts() -> list[Contrast]:
-    """All that the pages name."""
-    found = []
-    for metric in ("income", "survival_steps"):
-        for factor in ("sanctions", "monitoring"):
-            found.append(with_rule(factor, metric=metric, is_there=True))
-    found.append(with_rule("sanctions", metric="income", is_there=False))
-    found.append(with_rule("monitoring", metric="income", is_there=False))
-    tax, quota = ["tax, best found"], ["quota, by hand"]
-    equality = "income_equality"
-    best = ["quota, best found"]
-    teams = ["VDN", "QMIX", "MAPPO"]
-    alone = ["DQN", "PPO", "IPPO"]
-    found += [
-        Contrast("best tax - quota by hand, income", "best_rules", "income", tax, quota),
-        Contrast("best tax - quota by hand, equality of income", "best_rules", equality, tax, quota),
-        Contrast("best tax - best quota, equality of income", "best_rules", equality, tax, best),
-        Contrast("three teams - three that learn alone", LEARNERS, "collective_return", teams, alone),
-    ]
-    for one, other in (("VDN", "DQN"), ("QMIX", "DQN"), ("MAPPO", "PPO")):
-        found.append(Contrast(f"{one} - {other}", LEARNERS, "collective_return", [one], [other]))
-    for variant in ("as run", "published"):
-        for worlds, last in ((16, 50), (256, 256)):
-            more = [f"PPO, {variant}, {worlds} worlds"]
-            less = [f"PPO, {variant}, 1 world"]
-            label = f"PPO {variant}, {worlds} worlds - 1 world, last {last}"
-            found.append(Contrast(label, "many_worlds", "collective_return", more, less, last))
-    for change in ("quota", "penalty that is certain"):
-        for metric, title in ((equality, "equality of income"), ("survival_steps", "survival, turns")):
-            more = [f"DQN, full schedule: {change}"]
-            less = ["DQN, full schedule: nothing changed"]
-            label = f"full schedule, {change} - nothing changed, {title}, last 1,000"
-            found.append(Contrast(label, "elsewhere", metric, more, less, 1_000))
-    more = ["DQN, Melting Pot: quota"]
-    less = ["DQN, Melting Pot: twice the apples"]
-    found.append(Contrast("Melting Pot, quota - twice the apples, income", "elsewhere", "income", more, less))
-    return found
-
-
-def mean_of(contrast: Contrast, conditions: list[str], part: Part) -> NDArray[np.float64]:
-    """The mean over conditions of each replica, [R]."""
-    values = [values_of(contrast.study, one, contrast.metric, part, contrast.last) for one in conditions]
-    return np.mean(values, axis=0)
-
-
-def text_of(found: Estimate) -> str:
-    """A difference with its interval and the p-value of this comparison alone."""
-    return f"{found:+} | {found.p_value:.2g}"
+TAX: Final = ["tax, best found"]
+BY_HAND: Final = ["quota, by hand"]
+EQUALITY: Final = "income_equality"
+HARVEST: Final = "collective_return"
+CONTRASTS: Final = [
+    with_rule("sanctions", "income", is_there=True),
+    with_rule("monitoring", "income", is_there=True),
+    with_rule("sanctions", "survival_steps", is_there=True),
+    with_rule("monitoring", "survival_steps", is_there=True),
+    with_rule("sanctions", "income", is_there=False),
+    with_rule("monitoring", "income", is_there=False),
+    Contrast("best tax - quota by hand, income", "best_rules", "income", TAX, BY_HAND),
+    Contrast("best tax - quota by hand, equality of income", "best_rules", EQUALITY, TAX, BY_HAND),
+    Contrast("best tax - best quota, equality of income", "best_rules", EQUALITY, TAX, ["quota, best found"]),
+    Contrast(
+        "three teams - three that learn alone",
+        LEARNERS,
+        HARVEST,
+        ["VDN", "QMIX", "MAPPO"],
+        ["DQN", "PPO", "IPPO"],
+    ),
+    *(
+        Contrast(f"{team} - {alone}", LEARNERS, HARVEST, [team], [alone])
+        for team, alone in (("VDN", "DQN"), ("QMIX", "DQN"), ("MAPPO", "PPO"))
+    ),
+    *(
+        Contrast(
+            f"PPO {variant}, {worlds} worlds - 1 world, last {last}",
+            "many_worlds",
+            HARVEST,
+            [f"PPO, {variant}, {worlds} worlds"],
+            [f"PPO, {variant}, 1 world"],
+            last,
+        )
+        for variant in ("as run", "published")
+        for worlds, last in ((16, 50), (256, 256))
+    ),
+    *(
+        Contrast(
+            f"full schedule, {change} - nothing changed, {TITLES[metric]}, last 1,000",
+            "elsewhere",
+            metric,
+            [f"DQN, full schedule: {change}"],
+            ["DQN, full schedule: nothing changed"],
+            1_000,
+        )
+        for change in ("quota", "penalty that is certain")
+        for metric in (EQUALITY, "survival_steps")
+    ),
+    Contrast(
+        "Melting Pot, quota - twice the apples, income",
+        "elsewhere",
+        "income",
+        ["DQN, Melting Pot: quota"],
+        ["DQN, Melting Pot: twice the apples"],
+    ),
+]
+"""All that the pages name."""
 
 
 def side_by_side() -> list[str]:
-    """The conditions that are shown frozen beside learning, in Markdown."""
-    lines = [
-        "| condition | income while learning, apples | income frozen | frozen - while learning | "
-        "equality of the harvest, frozen | equality of income, frozen |",
-        "|---|" + "---:|" * 5,
-    ]
-    for label, (study, condition) in SIDE_BY_SIDE.items():
-        learning = values_of(study, condition, "income", "training")
-        frozen = values_of(study, condition, "income", "evaluation")
-        cells = [estimate(learning), estimate(frozen)]
-        equalities = [
-            estimate(values_of(study, condition, metric, "evaluation"))
-            for metric in ("equality", "income_equality")
-        ]
+    """Return the conditions that are shown frozen beside learning, in Markdown."""
+    head = ["condition", "income while learning, apples", "income frozen", "frozen - while learning"]
+    head += ["equality of the harvest, frozen", "equality of income, frozen"]
+    rows = []
+    for label, place in SIDE_BY_SIDE.items():
+        learning = values_of(*place, "income")
+        frozen = values_of(*place, "income", "evaluation")
         change = difference(frozen, learning, paired=True)
-        texts = [*map(str, cells), f"{change:+}", *map(str, equalities)]
-        lines.append(f"| {label} | {' | '.join(texts)} |")
-    return lines
+        equalities = [
+            str(estimate(values_of(*place, metric, "evaluation"))) for metric in ("equality", EQUALITY)
+        ]
+        rows.append([label, str(estimate(learning)), str(estimate(frozen)), f"{change:+}", *equalities])
+    return table(head, rows, numbers=5)
 
 
 def main(*, out: Path = RESULTS / "governs" / "contrasts.md") -> None:
@@ -140,24 +157,23 @@ def main(*, out: Path = RESULTS / "governs" / "contrasts.md") -> None:
     Args:
         out: the file.
     """
+    rows = []
+    for contrast in CONTRASTS:
+        cells = [contrast.label]
+        for part in ("training", "evaluation"):
+            change = contrast.difference(part)
+            cells += [f"{change:+}", f"{change.p_value:.2g}"]
+        rows.append(cells)
     lines = [
         "By `python recipes/study/contrasts.py`, which says what the columns mean.",
         "",
         *side_by_side(),
-        "",
         "Each p is of one comparison, not corrected for the others. Of learners and of many worlds the "
         "harvest is compared, in apples.",
         "",
-        "| contrast | while learning | p | frozen | p |",
-        "|---|" + "---:|" * 4,
+        *table(["contrast", "while learning", "p", "frozen", "p"], rows, numbers=4),
     ]
-    for contrast in contrasts():
-        cells = []
-        for part in ("training", "evaluation"):
-            pair = mean_of(contrast, contrast.more, part), mean_of(contrast, contrast.less, part)
-            cells.append(text_of(difference(*pair, paired=True)))
-        lines.append(f"| {contrast.label} | {' | '.join(cells)} |")
-    out.write_text("\n".join([*lines, ""]), encoding="utf-8")
+    out.write_text("\n".join(lines), encoding="utf-8")
 
 
 if __name__ == "__main__":

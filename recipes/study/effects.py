@@ -1,4 +1,4 @@
-"""Main effects and interactions of the design of recipes/study/together.py, from the study's table.
+"""Which effects do the factors of recipes/study/together.py have, alone and two together?
 
     python recipes/study/effects.py studies/together
     python recipes/study/effects.py studies/together --part evaluation
@@ -16,31 +16,33 @@ from pathlib import Path
 from typing import Annotated, Final, Literal
 
 import tyro
+from page import table
 from together import FACTORS, design, name
 
-from cprl.measuring.statistics import Estimate, Weights, contrasts, crossed, main_effect, mean_difference
+from cprl.measuring.statistics import CellWeights, Estimate, contrasts, crossed, main_effect, mean_difference
 from cprl.studies import StudyTable
 
 METRICS: Final = {"income": "income, apples", "survival_steps": "survival, turns"}
 
 
-def effects() -> dict[str, Weights]:
-    """What each condition counts in each effect: main effects, then groups of interactions of two factors."""
-    levels = {name(one): one for one in design()}
-    signs = {
-        factor: main_effect({row: one[factor] for row, one in levels.items()}, True, False)
-        for factor in FACTORS
-    }
+def effects() -> dict[str, CellWeights]:
+    """Return what each condition counts in each effect: main effects, then groups of interactions of two
+    factors."""
+    signs = {}
+    for factor in FACTORS:
+        levels_of = {name(levels): levels[factor] for levels in design()}
+        signs[factor] = main_effect(levels_of, True, False)
     groups: dict[tuple[float, ...], list[str]] = {}
     for one, other in combinations(FACTORS, 2):
         column = tuple(crossed(signs[one], signs[other]).values())
         groups.setdefault(column, []).append(f"{one} x {other}")
-    signs |= {" = ".join(names): dict(zip(levels, column, strict=True)) for column, names in groups.items()}
+    for column, names in groups.items():
+        signs[" = ".join(names)] = dict(zip(signs[FACTORS[0]], column, strict=True))
     return {label: mean_difference(column) for label, column in signs.items()}
 
 
 def marked(differences: Iterable[Estimate]) -> list[str]:
-    """Texts with signs, and with stars where they differ by Holm's method."""
+    """Return texts with signs, and with stars where they differ by Holm's method."""
     return [f"{one:+}{'*' * one.differs}" for one in differences]
 
 
@@ -57,15 +59,10 @@ def main(
         part: the last 30 episodes of training, or fresh episodes of the agents at its end, frozen.
     """
     rows = StudyTable.read(study / "table.parquet").windows(part)
-    columns = []
-    for metric in METRICS:
-        found = contrasts(rows, metric, "condition", effects())
-        labels = [label for label, _ in found]
-        columns.append(dict(zip(labels, marked(found.values()), strict=True)))
-    print(f"| effect of | {' | '.join(METRICS.values())} |")
-    print("|---|" + "---:|" * len(METRICS))
-    for label in columns[0]:
-        print(f"| {label} | {' | '.join(column[label] for column in columns)} |")
+    weights = effects()
+    columns = [marked(contrasts(rows, metric, "condition", weights).values()) for metric in METRICS]
+    lines = table(["effect of", *METRICS.values()], list(zip(weights, *columns, strict=True)), numbers=2)
+    print("\n".join(lines[:-1]))
 
 
 if __name__ == "__main__":

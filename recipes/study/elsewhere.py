@@ -9,10 +9,10 @@ experiment 5 as run, on its full schedule of 4,800 episodes in one world, which 
 """
 
 from dataclasses import replace
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
-from agents import crowded
 from base import PUBLISHED, TRAGEDY
 from best_rules import QUOTA
 from many_worlds import ppo
@@ -43,24 +43,23 @@ SETTINGS: Final[dict[str, tuple[Game, DQN | PPO, dict[str, Any]]]] = {
 
 
 def denser(board: Map) -> Map:
-    """The board with as many further sites as it has, on free ground by chance."""
-    taken = {*board.sites, *board.walls, *board.spawns, *((row, col) for row, col, _ in board.starts)}
-    free = [
-        (row, col) for row in range(board.height) for col in range(board.width) if (row, col) not in taken
-    ]
+    """Return the board with as many further sites as it has, on free ground by chance."""
+    starts = {(row, col) for row, col, _ in board.starts}
+    taken = {*board.sites, *board.walls, *board.spawns, *starts}
+    free = [cell for cell in product(range(board.height), range(board.width)) if cell not in taken]
     drawn = np.random.default_rng(0).choice(len(free), len(board.sites), replace=False)
     return replace(board, sites=(*board.sites, *(free[at] for at in drawn)))
 
 
 def games(game: Game) -> dict[str, Game]:
-    """The game under each change of it."""
-    is_commons = game is COMMONS
+    """Return the game under each change of it."""
     half = game.agents // 2
-    fewer = crowded(half) if is_commons else replace(game.map, starts=game.map.starts[:half])
+    fewer = replace(game.map, starts=game.map.starts[:half])
+    richer = scattered(2) if game is COMMONS else denser(game.map)
     regrow = tuple(min(1.0, 2 * prob) for prob in game.rules.regrow_prob)
     return {
         "nothing changed": game,
-        "twice the apples": replace(game, map=scattered(2) if is_commons else denser(game.map)),
+        "twice the apples": replace(game, map=richer),
         "regrowth x 2": replace(game, rules=replace(game.rules, regrow_prob=regrow)),
         "half the agents": replace(game, map=fewer),
         "networks of 2 units": game,
@@ -70,7 +69,7 @@ def games(game: Game) -> dict[str, Game]:
 
 
 def conditions() -> dict[str, dict[str, Any]]:
-    """Each change in each setting."""
+    """Return each change in each setting."""
     table = {}
     for setting, (game, algorithm, length) in SETTINGS.items():
         for change, changed in games(game).items():

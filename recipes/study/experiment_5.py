@@ -17,12 +17,12 @@ from dataclasses import replace
 from base import PUBLISHED
 
 import cprl
-from cprl.studies.factors import changed
+from cprl.studies.factors import with_changes
 
 BY = "agents.*.algorithm"
 
 STUDY = cprl.Study(
-    changed(replace(PUBLISHED, episodes=2600), {f"{BY}.settings.gamma": 0.997}),
+    with_changes(replace(PUBLISHED, episodes=2600), {f"{BY}.settings.gamma": 0.997}),
     {
         f"{BY}.loss_function": ["l2", "log_cosh"],
         f"{BY}.settings.optimizer": ["adam", "keras_rmsprop"],

@@ -2,40 +2,41 @@
 
     python recipes/study/governs.py
 
-To be run in the root of the repository: reads tables in docs/results, and writes into docs/results/governs
-table.md, governs.png, and elsewhere.md, six of the changes in the settings of elsewhere.py. In the conditions
-of table.md four DQN agents play `commons` as run, 200 episodes on the short schedule of base.py, with one
-thing changed, in the rows of PPO also the algorithm. Numbers are means over replicas of the last 30 episodes
-of each, "while learning", or of its 50 fresh episodes, "frozen".
+To be run in the root of the repository: reads tables and runs in docs/results, and writes into
+docs/results/governs table.md, governs.png, and elsewhere.md, six of the changes in the settings of
+elsewhere.py. In the conditions of table.md four DQN agents play `commons` as run, 200 episodes on the short
+schedule of base.py, with one thing changed, in the rows of PPO also the algorithm. Numbers are means over
+replicas of the last 30 episodes of each, "while learning", or of its 50 fresh episodes, "frozen".
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Final, Literal, NamedTuple
+from typing import Final, Literal
 
 import numpy as np
 import tyro
 from base import EXPERIMENT
 from effects import marked
-from numpy.typing import NDArray
+from page import table
 from possible import KNOWN
 
 from cprl.measuring.registry import METRICS
-from cprl.measuring.statistics import Estimate, difference, estimate, judged
+from cprl.measuring.statistics import Estimate, difference, estimate, judge_family
 from cprl.pictures.colours import BLUE, GREEN, GREY, ORANGE, PURPLE, VERMILION
-from cprl.runs.curves import as_curves, curves_of
-from cprl.runs.episodes import read_table
 from cprl.studies import StudyTable
 from cprl.studies.tables.comparing import values_of as replicas_of
+from cprl.studies.tables.pooled import pooled_table
 from cprl.terminal import style
-from cprl.terminal.style import RANDOM_LINE
+from cprl.terminal.panels import draw_dots
+from cprl.values.array_types import Float64
 
 RESULTS: Final = Path("docs", "results")
 LAST: Final = 30
 """Episodes at the end of each replica."""
 SCHEDULE: Final = EXPERIMENT.agents[0].algorithm.settings
-"""Of the exploration of DQN agents."""
+"""The schedule of the exploration of DQN agents."""
 AT_MOST: Final = {
     "regrowth x 0.25": 717,
     "regrowth x 0.5": 1344,
@@ -53,9 +54,9 @@ AT_MOST: Final = {
     "quarters, walls": 2189,
     "2 agents": 2000,
 }
-"""What nobody can exceed on average in an episode, in apples, where it is not that of the unchanged game: the
-smaller of an apple for each agent and turn, and of the bound of `yield_bounds` with the first
-stock, as in possible.py."""
+"""The apples that nobody can exceed on average in an episode, where they are not those of the unchanged game:
+the smaller of an apple for each agent and turn, and of the bound of `yield_bounds` with the first stock, as
+in possible.py."""
 
 GROUPS: Final = {
     "none": (GREY, "nothing changed"),
@@ -74,7 +75,21 @@ SPACE: Final = (
 )
 """Conditions of recipes/study/space.py, which are their names here."""
 
+INSTITUTIONS: Final = {
+    "boundaries": "boundaries (1)",
+    "quota": "quota (2)",
+    "vote": "vote on a tax (3)",
+    "monitoring": "monitored quota (4)",
+    "graduated_sanctions": "graduated sanctions (5)",
+    "mediation": "mediation (6)",
+    "sanctioner": "elected sanctioner (7)",
+    "levies": "nested levies (8)",
+}
+"""The names of the runs of recipes/institutions.py, with the number of Ostrom's principle."""
+
+NONE: Final = ("institutions", "name=institutions_none", "nothing changed")
 STUDIES: Final = {
+    "none": [NONE],
     "resource": [
         *(("regrowth", f"regrowth={k}", f"regrowth x {k}") for k in ("0.25", "0.5", "2", "4")),
         *(("space", condition, condition) for condition in SPACE),
@@ -105,43 +120,33 @@ STUDIES: Final = {
         ("talk", "talk", "cheap talk"),
         ("talk", "quota", "quota that may be broken (2)"),
         ("talk", "quota, talk", "the same quota, and talk"),
+        *(("institutions", f"name=institutions_{run}", name) for run, name in INSTITUTIONS.items()),
     ],
 }
 """By group: the study, its condition, and the name here."""
-
-INSTITUTIONS: Final = {
-    "boundaries": "boundaries (1)",
-    "quota": "quota (2)",
-    "vote": "vote on a tax (3)",
-    "monitoring": "monitored quota (4)",
-    "graduated_sanctions": "graduated sanctions (5)",
-    "mediation": "mediation (6)",
-    "sanctioner": "elected sanctioner (7)",
-    "levies": "nested levies (8)",
-}
-"""By the directory of the run: the name, with the number of Ostrom's principle."""
 
 AS_HERE: Final = {
     "twice the apples": ("space", "twice the apples, scattered", "commons"),
     "regrowth x 2": ("regrowth", "regrowth=2", "regrowth=1"),
     "half the agents": ("agents", "2, same board", "4"),
     "networks of 2 units": ("network_width", "hidden_cells=(2, 2)", "hidden_cells=(32, 32)"),
-    "quota": ("institutions", "quota", "none"),
+    "quota": ("institutions", "name=institutions_quota", NONE[1]),
     "penalty that is certain": ("rules", "automatic penalty", "none"),
 }
 """The changes of recipes/study/elsewhere.py: where they are on the short schedule, and what beside."""
 
-RANDOM, RESTRAINT = 282.0, 926.0
+RANDOM: Final = 282.0
+RESTRAINT: Final = 926.0
 """Apples an episode of random play (docs/institutions.md) and of the scripted "sustainable" agents
 (docs/results/schelling/table.md), on the unchanged game."""
 TICKS: Final = (50, 100, 200, 500, 2000)
 """Apples, on the axis of the figure."""
 
-
 Part = Literal["training", "evaluation"]
 
 
-class Row(NamedTuple):
+@dataclass(frozen=True, kw_only=True)
+class Row:
     """A condition and its measurements over replicas."""
 
     group: str
@@ -154,154 +159,102 @@ class Row(NamedTuple):
     trend: Estimate
     """Income in the last 30 episodes of training minus the 30 before."""
     survival: Estimate
-    """Turns."""
+    """The turns of an episode."""
     equality: Estimate
-    """Of the harvest."""
+    """The equality of the harvest."""
     income_equality: Estimate
     turns: float
-    """Of the whole training, from each of which agents learn."""
+    """The turns of the whole training, from each of which agents learn."""
     exploration: str
     """The share of random actions in the last 30 episodes, from the first of them to the end."""
 
     @property
-    def share(self) -> float:
-        """Of the most that is possible."""
-        return self.income.value / AT_MOST.get(self.name, KNOWN["commons", "as_run"].at_most)
+    def cells(self) -> list[str]:
+        """Return the texts of a row of the table."""
+        most = AT_MOST.get(self.name, KNOWN["commons", "as_run"].at_most)
+        return [
+            *(self.name, GROUPS[self.group][1], str(self.replicas), text_of(self.income)),
+            *(text_of(self.frozen), text_of(self.trend, sign="+"), f"{self.income.value / most:.0%}"),
+            *(text_of(self.survival, most=1000), text_of(self.equality, most=1)),
+            *(text_of(self.income_equality, most=1), f"{self.turns:,.0f}", self.exploration),
+        ]
+
+
+COLUMNS: Final = (
+    *("changed", "group", "replicas", "income while learning, apples", "income frozen"),
+    *("last 30 minus the 30 before", "share of the most possible", "survival, turns"),
+    *("equality of the harvest", "equality of income", "turns of training", "exploration at the end"),
+)
 
 
 @cache
 def table_of(study: str) -> StudyTable:
-    """The committed table of a study."""
+    """Return the committed table of a study, or that of the runs of recipes/institutions.py."""
+    if study == "institutions":
+        return pooled_table([RESULTS / study], by=["name"])
     return StudyTable.read(RESULTS / "studies" / study / "table.parquet")
 
 
-def values_of(
-    study: str, condition: str, metric: str, part: Part = "training", last: int = LAST
-) -> NDArray[np.float64]:
-    """A metric of each replica; "income" is the income, and without money the harvest."""
-    values = by_condition(study, metric, part, last).get(condition)
-    same_as = METRICS[metric].same_as
-    if not values and same_as is not None:
-        values = by_condition(study, same_as, part, last)[condition]
-    return np.array(list(values.values()))
-
-
 @cache
-def by_condition(study: str, metric: str, part: Part, last: int) -> dict[str, dict[int, float]]:
-    """A metric of each replica, by condition."""
+def _by_condition(study: str, metric: str, part: Part, last: int) -> Mapping[str, Mapping[int, float]]:
     return replicas_of(table_of(study).windows(part, last=last), metric)
 
 
-def nets(study: str, condition: str, part: Part = "training", last: int = LAST) -> NDArray[np.float64]:
-    """The income of each replica, in apples."""
-    if study == "institutions":
-        return np.nanmean(curves_of(RESULTS / study / condition)["income"][:, -LAST:], 1)
-    return values_of(study, condition, "income", part, last)
+def values_of(study: str, condition: str, metric: str, part: Part = "training", last: int = LAST) -> Float64:
+    """Return a metric of each replica; "income" is the income, and without money the harvest."""
+    values = _by_condition(study, metric, part, last).get(condition)
+    same_as = METRICS[metric].same_as
+    if not values and same_as is not None:
+        values = _by_condition(study, same_as, part, last)[condition]
+    return np.array(list(values.values()))
 
 
-def of_study(group: str, study: str, condition: str, name: str) -> Row:
-    """A condition of a study."""
+def row_of(group: str, study: str, condition: str, name: str) -> Row:
+    """Return a condition of a study as a row."""
+
+    def mean(metric: str, part: Part = "training") -> Estimate:
+        return estimate(values_of(study, condition, metric, part))
+
     income = values_of(study, condition, "income")
-    of_both = values_of(study, condition, "income", last=2 * LAST)
-    turns = values_of(study, condition, "survival_steps")
-    of_all = values_of(study, condition, "survival_steps", last=EXPERIMENT.episodes)
+    income_of_60 = values_of(study, condition, "income", last=2 * LAST)
+    turns = (
+        values_of(study, condition, "survival_steps", last=EXPERIMENT.episodes).mean() * EXPERIMENT.episodes
+    )
+    survival = mean("survival_steps")
+    exploration = "of its policy"
+    if study != "networks":
+        steps = (turns - survival.value * LAST, turns)
+        epsilons = [f"{SCHEDULE.epsilon(int(step)):.2f}" for step in steps]
+        exploration = " to ".join(dict.fromkeys(epsilons))
     return Row(
         group=group,
         name=name,
         replicas=len(income),
         income=estimate(income),
-        frozen=estimate(values_of(study, condition, "income", "evaluation")),
-        trend=estimate(2 * (income - of_both)),
-        survival=estimate(turns),
-        equality=estimate(values_of(study, condition, "equality")),
-        income_equality=estimate(values_of(study, condition, "income_equality")),
-        turns=of_all.mean() * EXPERIMENT.episodes,
-        exploration="of its policy" if study == "networks" else explored(of_all.mean(), turns.mean()),
+        frozen=mean("income", "evaluation"),
+        trend=estimate(2 * (income - income_of_60)),
+        survival=survival,
+        equality=mean("equality"),
+        income_equality=mean("income_equality"),
+        turns=turns,
+        exploration=exploration,
     )
-
-
-def of_run(group: str, folder: str, name: str) -> Row:
-    """A run of recipes/institutions.py."""
-    run = RESULTS / "institutions" / folder
-    curves = curves_of(run)
-    fresh = as_curves(read_table(run / "evaluation" / "trained.parquet"))
-    income = curves["income"]
-    ends = at_end(income)
-    turns = curves["survival_steps"]
-    return Row(
-        group=group,
-        name=name,
-        replicas=len(income),
-        income=estimate(ends),
-        frozen=estimate(fresh["income"].mean(1)),
-        trend=estimate(ends - income[:, -2 * LAST : -LAST].mean(1)),
-        survival=estimate(at_end(turns)),
-        equality=estimate(at_end(curves["equality"])),
-        income_equality=estimate(at_end(income_equality(curves))),
-        turns=turns.mean() * EXPERIMENT.episodes,
-        exploration=explored(turns.mean(), turns[:, -LAST:].mean()),
-    )
-
-
-def income_equality(curves: Mapping[str, NDArray[np.float64]]) -> NDArray[np.float64]:
-    """The equality of income by episode, which without money is that of the harvest."""
-    return curves.get("income_equality", curves["equality"])
-
-
-def at_end(curve: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The mean of the last episodes of each replica, [R]."""
-    return np.nanmean(curve[:, -LAST:], 1)
-
-
-def explored(turns: float, last_turns: float) -> str:
-    """Epsilon at the beginning of the last episodes and at the end of the training.
-
-    Args:
-        turns: of an episode, the mean over all of them.
-        last_turns: of one of the last.
-    """
-    at_the_end = turns * EXPERIMENT.episodes
-    before = at_the_end - last_turns * LAST
-    epsilons = [f"{SCHEDULE.epsilon(int(steps)):.2f}" for steps in (before, at_the_end)]
-    return " to ".join(dict.fromkeys(epsilons))
 
 
 def rows() -> list[Row]:
-    """All conditions, group by group, in each the largest income first."""
-    found = [of_run("none", "none", "nothing changed")]
+    """Return all conditions, group by group, in each the largest income first."""
+    every = []
     for group, conditions in STUDIES.items():
-        found += [of_study(group, *condition) for condition in conditions]
-    found += [of_run("institutions", folder, name) for folder, name in INSTITUTIONS.items()]
-    order = list(GROUPS)
-    return sorted(found, key=lambda one: (order.index(one.group), -one.income.value))
+        group_rows = [row_of(group, *condition) for condition in conditions]
+        every += sorted(group_rows, key=lambda row: -row.income.value)
+    return every
 
 
-def text_of(found: Estimate, most: float = np.inf, sign: str = "") -> str:
-    """A mean with its interval, which ends at the most that is possible."""
-    digits = 2 if found.high < 5 and not sign else 0
-    numbers = found.value, found.low, found.high
-    value, low, high = (f"{min(number, most):{sign},.{digits}f}" for number in numbers)
+def text_of(one: Estimate, most: float = np.inf, sign: str = "") -> str:
+    """Return a mean with its interval, which ends at the most that is possible."""
+    digits = 2 if one.high < 5 and not sign else 0
+    value, low, high = (f"{min(number, most):{sign},.{digits}f}" for number in (one.value, one.low, one.high))
     return f"{value} [{low}, {high}]"
-
-
-def table(found: list[Row]) -> str:
-    """The table in Markdown."""
-    columns = [
-        *("changed", "group", "replicas", "income while learning, apples", "income frozen"),
-        *("last 30 minus the 30 before", "share of the most possible", "survival, turns"),
-        *("equality of the harvest", "equality of income", "turns of training"),
-        "exploration at the end",
-    ]
-    lines = [f"| {' | '.join(columns)} |", "|---|---|" + "---:|" * (len(columns) - 2)]
-    for one in found:
-        cells = [
-            *(one.name, GROUPS[one.group][1], str(one.replicas), text_of(one.income), text_of(one.frozen)),
-            *(text_of(one.trend, sign="+"), f"{one.share:.0%}", text_of(one.survival, most=1000)),
-            *(text_of(one.equality, most=1), text_of(one.income_equality, most=1)),
-            *(f"{one.turns:,.0f}", one.exploration),
-        ]
-        lines.append(f"| {' | '.join(cells)} |")
-    return "\n".join([*lines, ""])
 
 
 LONGER: Final = {"PPO, 256 worlds": 256, "DQN, full schedule": 1_000}
@@ -309,87 +262,82 @@ LONGER: Final = {"PPO, 256 worlds": 256, "DQN, full schedule": 1_000}
 and as many as agents need that go up and down over hundreds, chosen after the last 30 were seen."""
 
 
-def elsewhere() -> str:
-    """Tables in Markdown of what each change adds by setting, and how many times the income it gives."""
-    parts: list[tuple[str, Part, Mapping[str, int]]] = [
-        ("While learning, the last 30 episodes", "training", {}),
-        ("While learning, longer ends: 256 episodes of PPO, 1,000 of the full schedule", "training", LONGER),
-        ("Frozen, in fresh worlds", "evaluation", {}),
-    ]
-    lines = [
+def elsewhere() -> list[str]:
+    """Return tables in Markdown of what each change adds by setting, and how many times the income it
+    gives."""
+    longer = "While learning, longer ends: 256 episodes of PPO, 1,000 of the full schedule:"
+    return [
         "Income, apples, and what each change adds, paired by replica.",
         "Stars: not 0 by Holm's method for the 24 changes of the last four columns together, and for the six "
         "of the first column.",
         "",
+        *("While learning, the last 30 episodes:", "", *elsewhere_table("training", {})),
+        *(longer, "", *elsewhere_table("training", LONGER)),
+        *("Frozen, in fresh worlds:", "", *elsewhere_table("evaluation", {})),
     ]
-    for title, part, last in parts:
-        lines += [f"{title}:", "", *elsewhere_table(part, last), ""]
-    return "\n".join(lines)
 
 
 def elsewhere_table(part: Part, last: Mapping[str, int]) -> list[str]:
-    """A table of what each change adds by setting."""
+    """Return a table of what each change adds by setting."""
     conditions = table_of("elsewhere").design.conditions
     settings = list(dict.fromkeys(name.partition(": ")[0] for name in conditions))
-    bases, pairs = [], []
+    bases = {}
+    changed = []
     for setting in settings:
         episodes = last.get(setting, LAST)
-        base = nets("elsewhere", f"{setting}: nothing changed", part, episodes)
-        bases.append(text_of(estimate(base)))
-        pairs += [(nets("elsewhere", f"{setting}: {change}", part, episodes), base) for change in AS_HERE]
-    texts = changes(pairs)
+        base, *others = (
+            values_of("elsewhere", f"{setting}: {change}", "income", part, episodes)
+            for change in ("nothing changed", *AS_HERE)
+        )
+        bases[setting] = base
+        changed += [(income, base) for income in others]
+    texts = change_texts(changed)
     columns = [texts[first : first + len(AS_HERE)] for first in range(0, len(texts), len(AS_HERE))]
     if part == "training":
-        here = [(nets(study, name), nets(study, base)) for study, name, base in AS_HERE.values()]
-        settings.insert(0, "DQN, 1 world")
-        bases.insert(0, text_of(estimate(here[0][1])))
-        columns.insert(0, changes(here))
-    lines = [f"| apples | {' | '.join(settings)} |", "|---|" + "---:|" * len(settings)]
-    lines.append(f"| nothing changed | {' | '.join(bases)} |")
-    for change, *cells in zip(AS_HERE, *columns, strict=True):
-        lines.append(f"| {change} | {' | '.join(cells)} |")
-    return lines
+        here = [
+            (values_of(study, name, "income"), values_of(study, base, "income"))
+            for study, name, base in AS_HERE.values()
+        ]
+        bases = {"DQN, 1 world": here[0][1], **bases}
+        columns.insert(0, change_texts(here))
+    lines = [["nothing changed", *(text_of(estimate(base)) for base in bases.values())]]
+    lines += zip(AS_HERE, *columns, strict=True)
+    return table(["apples", *bases], lines, numbers=len(bases))
 
 
-def changes(pairs: list[tuple[NDArray[np.float64], NDArray[np.float64]]]) -> list[str]:
-    """The difference of each, paired by replica, and the ratio; stars by Holm's method for all of these."""
-    found = {(str(place),): difference(*pair, paired=True) for place, pair in enumerate(pairs)}
-    texts = marked(judged(found).values())
+def change_texts(pairs: Sequence[tuple[Float64, Float64]]) -> list[str]:
+    """Return the difference of each, paired by replica, and the ratio; stars by Holm's method for all of
+    these."""
+    changes = {(str(place),): difference(*pair, paired=True) for place, pair in enumerate(pairs)}
+    texts = marked(judge_family(changes).values())
     ratios = [value.mean() / base.mean() for value, base in pairs]
     return [f"{text}, x {ratio:.1f}" for text, ratio in zip(texts, ratios, strict=True)]
 
 
-def draw(found: list[Row], path: Path) -> None:
+def draw(rows: Sequence[Row], path: Path) -> None:
     """Draw income, survival and equality of each condition."""
-    panels_of = {"income": "income, apples (log)", "survival": "survival, turns"}
-    panels_of |= {"income_equality": "equality of income"}
+    titles = {"income": "income, apples (log)", "survival": "survival, turns"}
+    titles |= {"income_equality": "equality of income"}
     with style.drawing(path) as sheet:
-        panels = sheet.panels(3, columns=3, high=1.5 * len(found) + 4, sharey=True)
-        for axes, (metric, title) in zip(panels, panels_of.items(), strict=True):
-            named: set[str] = set()
-            for place, one in enumerate(found):
-                colour, group = GROUPS[one.group]
-                measured = getattr(one, metric)
-                shade = np.array(colour) / 255
-                axes.plot([measured.low, measured.high], [place, place], color=shade, linewidth=2)
-                label = group if axes is panels[0] and group not in named else None
-                axes.plot([measured.value], [place], "o", color=shade, markersize=5, label=label)
-                named.add(group)
+        panels = sheet.panels(3, columns=3, high=1.5 * len(rows) + 4, sharey=True)
+        for axes, (metric, title) in zip(panels, titles.items(), strict=True):
+            for group, (colour, label) in GROUPS.items():
+                places = [place for place, row in enumerate(rows) if row.group == group]
+                means = [getattr(rows[place], metric) for place in places]
+                draw_dots(axes, places, means, across=True, color=np.array(colour) / 255, label=label)
+                axes.axhline(places[-1] + 0.5, color="#d0d0d0", linewidth=0.8)
             axes.set_title(title)
             axes.grid(axis="x", alpha=0.3)
-            groups = [one.group for one in found]
-            for place in range(1, len(found)):
-                if groups[place] != groups[place - 1]:
-                    axes.axhline(place - 0.5, color="#d0d0d0", linewidth=0.8)
             if metric != "income":
                 axes.locator_params(axis="x", nbins=5)
-        panels[0].set_yticks(range(len(found)), [one.name for one in found])
-        panels[0].axvline(RANDOM, **RANDOM_LINE, label="random play")
-        panels[0].axvline(RESTRAINT, color="#555555", linestyle=":", label="scripted restraint")
-        panels[0].set_xscale("log")
-        panels[0].set_xticks(TICKS, [f"{apples:,}" for apples in TICKS])
-        panels[0].minorticks_off()
-        panels[0].set_ylim(len(found) - 0.3, -0.7)
+        income = panels[0]
+        income.set_yticks(range(len(rows)), [row.name for row in rows])
+        income.axvline(RANDOM, **style.RANDOM_LINE, label="random play")
+        income.axvline(RESTRAINT, color="#555555", linestyle=":", label="scripted restraint")
+        income.set_xscale("log")
+        income.set_xticks(TICKS, [f"{apples:,}" for apples in TICKS])
+        income.minorticks_off()
+        income.set_ylim(len(rows) - 0.3, -0.7)
         sheet.title = "What governs the commons"
         sheet.caption = (
             f"Four learners, last {LAST} of 200 episodes; 95 % intervals by Student's t over replicas. "
@@ -404,11 +352,12 @@ def main(*, out: Path = RESULTS / "governs") -> None:
     Args:
         out: the directory.
     """
-    found = rows()
+    every = rows()
     out.mkdir(parents=True, exist_ok=True)
-    (out / "table.md").write_text(table(found), encoding="utf-8")
-    (out / "elsewhere.md").write_text(elsewhere(), encoding="utf-8")
-    draw(found, out / "governs.png")
+    lines = table(COLUMNS, [row.cells for row in every], numbers=len(COLUMNS) - 2)
+    (out / "table.md").write_text("\n".join(lines), encoding="utf-8")
+    (out / "elsewhere.md").write_text("\n".join(elsewhere()), encoding="utf-8")
+    draw(every, out / "governs.png")
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What more experience changes: PPO and DQN on `commons` in 1, 16 and 256 worlds.
+"""What does more experience change? PPO and DQN on `commons` in 1, 16 and 256 worlds.
 
     python recipes/study/many_worlds.py --jobs 1
 
@@ -27,7 +27,7 @@ LONG: Final = 100_000_000
 
 
 def dqn(worlds: int, steps: int) -> DQN:
-    """Exploration decays over the first half of the training."""
+    """Return DQN whose exploration decays over the first half of the training."""
     settings = DQNSettings(
         gamma=0.99,
         learning_rate=1e-3,

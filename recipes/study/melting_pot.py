@@ -1,4 +1,4 @@
-"""Independent PPO agents with shared parameters on Melting Pot's open commons, in many worlds.
+"""What do agents learn on Melting Pot's open commons? Independent PPO with shared parameters, in many worlds.
 
     python recipes/study/melting_pot.py --steps 20_000_000
 

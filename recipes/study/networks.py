@@ -21,7 +21,7 @@ NETWORK = "agents.*.algorithm.network"
 
 
 def latest(frames: int) -> dict[str, list[Custom]]:
-    """Each agent observes its latest windows, the oldest first."""
+    """Return a condition in which each agent observes its latest windows, the oldest first."""
     arguments = {"N": frames, "dim": -3, "in_keys": [["agents", "observation"]]}
     return {"transforms": [Custom("torchrl.envs:CatFrames", arguments)]}
 

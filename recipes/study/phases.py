@@ -1,8 +1,4 @@
-"""Phases of a training of the study of 2019: change points of the social metrics, and how figures draw them.
-
-find_phases   the phases of curves
-phases_of     those of a run, of running means
-draw_bands    behind curves; `draw_strip` above them
+"""What phases has a training of experiment 5? Change points of the social metrics, and their patterns.
 
 In a phase every metric follows a straight line over the episodes; the lines of adjacent phases need not meet.
 The change points minimise the squared error summed over all metrics, each in units of its own standard
@@ -12,23 +8,22 @@ point detection methods" (2020)).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any, Final
+from itertools import pairwise, zip_longest
+from typing import Final
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike, NDArray
+from page import section
+from published import EXPERIMENT_5
+from results import TOO_FEW, Result
 
-from cprl.measuring.windows import SMOOTHED_EPISODES, centres, running_mean
-from cprl.terminal.style import CHARACTER, Sheet
-
-Values = NDArray[np.float64]
+from cprl.measuring.windows import running_mean
+from cprl.values.array_types import Float64
 
 PHASES: Final = ("exploration", "tragedy", "combat", "cultivation")
 """The study's names of phases, in its order."""
 UNNAMED: Final = "none of the four patterns"
-"""What a phase without a label is called."""
+"""The name of a phase without a label."""
 PHASES_BEGIN: Final = (450, 1500, 2400)
 """The episodes at which tragedy, combat and cultivation begin in the study's figures of experiment 5."""
 METRICS: Final = ("collective_return", "equality", "survival_steps", "peacefulness")
@@ -74,46 +69,55 @@ def change_points(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, numb
         number: The number of change points.
 
     Raises:
-        ValueError: If there are too few or too many episodes, or a metric is NaN in some episode of all
-            replicas.
+        ValueError: If there are too few or too many episodes, or a metric is NaN in one of all replicas.
     """
     at = np.asarray(episodes, np.float64)
-    if at[-1] - at[0] > LONGEST:
-        raise ValueError(f"episodes are {at[0]:g} to {at[-1]:g}; allowed: at most {LONGEST:,} episodes")
-    grid = np.arange(at[0], at[-1] + 1e-9, GRID / _JUMP)
-    if (grid[-1] - grid[0]) < (number + 1) * SHORTEST:
+    shortest = (number + 1) * SHORTEST
+    if not shortest <= at[-1] - at[0] <= LONGEST:
         raise ValueError(
-            f"episodes {at[0]:g} to {at[-1]:g} are too few for {number + 1} phases of at least {SHORTEST}"
+            f"episodes are {at[0]:g} to {at[-1]:g}; allowed: {shortest:,} to {LONGEST:,} of them"
         )
-    on_grid = np.stack([np.interp(grid, at, _over_replicas(curve)) for curve in metrics.values()], axis=1)
+    grid = np.arange(at[0], at[-1] + 1e-9, GRID / _JUMP)
+    on_grid = np.stack([np.interp(grid, at, _mean(curve)) for curve in metrics.values()], axis=1)
     if not np.isfinite(on_grid).all():
         raise ValueError(
-            "a metric is NaN in some episode of all replicas; allowed: finite means over replicas "
-            "(omit the metric or fill the gap)"
+            "a metric is NaN in some episode of all replicas; allowed: finite means over replicas"
         )
     spread = on_grid.std(0)
     signal = (on_grid - on_grid.mean(0)) / np.where(spread > 0, spread, 1.0)
-    ends = np.array([*range(0, len(signal), _JUMP), len(signal)])
-    if ends[-1] == ends[-2]:
-        ends = ends[:-1]
+    ends = np.unique([*range(0, len(signal), _JUMP), len(signal)])
     costs = _costs_of_lines(signal, ends)
     # best[e]: the least cost of k + 1 segments up to ends[e]; before[k][e]: where the last of them begins.
-    best, before = costs[0], []
+    best = costs[0]
+    before = []
     for _ in range(number):
         totals = best[:, None] + costs
         before.append(totals.argmin(0))
         best = totals.min(0)
-    place, changes = len(ends) - 1, []
-    for of_last in reversed(before):
-        place = of_last[place]
+    place = len(ends) - 1
+    changes = []
+    for begins in reversed(before):
+        place = begins[place]
         changes.append(float(grid[ends[place] - 1]))
     return changes[::-1]
 
 
-def find_phases(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], *, number: int = 3) -> list[Phase]:
-    """Return the phases between `number` change points; see `change_points` and `phases`."""
-    changes = change_points(episodes, metrics, number=number) if number else []
-    return phases(episodes, metrics, changes)
+def _costs_of_lines(signal: Float64, ends: NDArray[np.int64]) -> Float64:
+    """Return the squared error of the best straight lines from ends[i] to ends[j] of a signal [G, M], summed
+    over metrics, [P, P] for P ends; infinite for segments shorter than `SHORTEST`."""
+    place = np.arange(len(signal))[:, None]
+    sums = np.stack([signal, signal * place, signal**2]).cumsum(1)
+    sums = np.concatenate([np.zeros_like(sums[:, :1]), sums], 1)[:, ends]
+    costs = np.full((len(ends), len(ends)), np.inf)
+    for last, end in enumerate(ends):
+        starts = ends[ends <= end - _LEAST]
+        size = (end - starts)[:, None]
+        middle = ((starts + end - 1) / 2)[:, None]
+        total, by_place, squares = sums[:, last, None] - sums[:, : len(starts)]
+        places = size * (size**2 - 1) / 12  # the sum of (place - middle)**2
+        slopes = (by_place - middle * total) ** 2 / places
+        costs[: len(starts), last] = (squares - total**2 / size - slopes).sum(1)
+    return costs
 
 
 def phases(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], changes: Sequence[float]) -> list[Phase]:
@@ -129,27 +133,16 @@ def phases(episodes: ArrayLike, metrics: Mapping[str, ArrayLike], changes: Seque
     Args:
         episodes: The index of each episode, [E], increasing.
         metrics: float [E] or [R, E] by name; at least `METRICS`.
-
-    Raises:
-        ValueError: If a phase has fewer than two episodes.
     """
     at = np.asarray(episodes, np.float64)
-    means = {name: _over_replicas(metrics[name]) for name in METRICS}
-    bounds = [at[0], *changes, at[-1]]
+    means = {name: _mean(metrics[name]) for name in METRICS}
     divided: list[Phase] = []
-    for first, last in pairwise(bounds):
-        inside = (at >= first) & (at <= last)
-        if inside.sum() < 2:
-            raise ValueError(
-                f"the phase from episode {first:g} to {last:g} has {inside.sum()} episodes; allowed: at "
-                "least 2"
-            )
-        change = {
-            name: float(
-                np.polyfit(at[inside], curve[inside], 1)[0] * (last - first) / max(np.ptp(curve), 1e-12)
-            )
-            for name, curve in means.items()
-        }
+    for first, last in pairwise([at[0], *changes, at[-1]]):
+        is_inside = (at >= first) & (at <= last)
+        change = {}
+        for name, curve in means.items():
+            rise = np.polyfit(at[is_inside], curve[is_inside], 1)[0] * (last - first)
+            change[name] = float(rise / max(np.ptp(curve), 1e-12))
         label = _label(change, [phase.label for phase in divided])
         divided.append(Phase(first=float(first), last=float(last), label=label, change=change))
     return divided
@@ -168,107 +161,110 @@ def _label(change: Mapping[str, float], before: Sequence[str | None]) -> str | N
     return None
 
 
-def _over_replicas(curve: ArrayLike) -> Values:
-    """Means over replicas that ignore NaN, [R, E] or [E] to [E]; NaN if all replicas are NaN."""
+def find_phases(episodes: ArrayLike, metrics: Mapping[str, ArrayLike]) -> list[Phase]:
+    """Return the phases between three change points; see `change_points` and `phases`."""
+    return phases(episodes, metrics, change_points(episodes, metrics))
+
+
+def _mean(curve: ArrayLike) -> Float64:
+    """Return means over replicas that ignore NaN, [R, E] or [E] to [E]; NaN if all replicas are NaN."""
     curves = np.atleast_2d(np.asarray(curve, np.float64))
-    defined = ~np.isnan(curves)
+    is_defined = ~np.isnan(curves)
     with np.errstate(invalid="ignore"):
-        means: Values = np.where(defined, curves, 0.0).sum(0) / defined.sum(0)
-    return means
+        return np.where(is_defined, curves, 0.0).sum(0) / is_defined.sum(0)
 
 
-def _costs_of_lines(signal: Values, ends: NDArray[np.int64]) -> Values:
-    """The squared error of the best straight lines from ends[i] to ends[j] of a signal [G, M], summed over
-    metrics, [P, P] for P ends; infinite for segments shorter than `SHORTEST`."""
-    place = np.arange(len(signal))[:, None]
-    sums = np.stack([signal, signal * place, signal**2]).cumsum(1)
-    sums = np.concatenate([np.zeros_like(sums[:, :1]), sums], 1)[:, ends]
-    costs = np.full((len(ends), len(ends)), np.inf)
-    for last, end in enumerate(ends):
-        starts = ends[ends <= end - _LEAST]
-        size, middle = (end - starts)[:, None], ((starts + end - 1) / 2)[:, None]
-        total, by_place, squares = sums[:, last, None] - sums[:, : len(starts)]
-        places = size * (size**2 - 1) / 12  # the sum of (place - middle)**2
-        slopes = (by_place - middle * total) ** 2 / places
-        costs[: len(starts), last] = (squares - total**2 / size - slopes).sum(1)
-    return costs
-
-
-def phases_of(curves: Mapping[str, Values], *, centred: bool = False) -> list[Phase] | None:
-    """Return the phases of a training, of running means over `SMOOTHED_EPISODES`.
+def training_phases(curves: Mapping[str, Float64]) -> list[Phase] | None:
+    """Return the phases of a training, of running means over 100 episodes, each at its first one.
 
     Args:
         curves: Those of `cprl.runs.curves.curves_of`.
-        centred: Whether an episode is the centre of its running mean; else its first, as in the study.
 
     Returns:
         None for a number of episodes that is not in `EPISODES`, a single agent, a game that does not report
         the metrics, or a metric that is undefined in a whole window.
     """
-    if not set(METRICS) <= set(curves) or "return_1" not in curves:
+    if not {*METRICS, "return_1"} <= set(curves):
         return None
-    whole = curves["survival_steps"]
-    if whole.shape[1] not in EPISODES:
+    if curves["survival_steps"].shape[1] not in EPISODES:
         return None
     smoothed = {name: running_mean(curves[name]) for name in METRICS}
     if any(np.isnan(means).all(0).any() for means in smoothed.values()):
         return None
-    at = centres(whole, SMOOTHED_EPISODES)
-    return find_phases(at if centred else at - at[0], smoothed)
+    return find_phases(np.arange(smoothed["equality"].shape[1]), smoothed)
 
 
-Bands = Sequence[tuple[float, float, str]]
-"""First episode, last episode and name of each phase."""
-
-COLOURS: Final = {
-    "exploration": "#e4e4e4",
-    "tragedy": "#f9cdbf",
-    "combat": "#faecb4",
-    "cultivation": "#e0d4f0",
-    UNNAMED: "#ffffff",
-}
-"""Light enough for curves before them; the four are apart under deuteranopia too."""
-STRIP: Final = 2.0
-"""The height of a row of a strip in em."""
+SURVIVED: Final = 990
+"""The running mean of survival, in steps of an episode's 1000, below which survival counts as falling."""
+_RESAMPLES: Final = 200
 
 
-def bands_of(phases: Sequence[Phase]) -> Bands:
-    """Return the phases as bands of a figure."""
-    return [(phase.first, phase.last, phase.label or UNNAMED) for phase in phases]
+def sections(results: Sequence[Result]) -> list[str]:
+    """Return the sections on phases and on turning points, those of the published curves first; nothing
+    without a run of experiment 5."""
+    runs = [result for result in results if result.study == EXPERIMENT_5]
+    if not runs:
+        return []
+    rows = [["published curves", *_phase_cells(_published_phases())]]
+    for result in runs:
+        divided = training_phases(result.curves)
+        cells = _phase_cells(divided, _change_intervals(result)) if divided else [TOO_FEW]
+        rows.append([result.name, *cells])
+    note = (
+        f"The study draws its phases from {', '.join(map(str, PHASES_BEGIN))} on. "
+        "See `recipes/study/phases.py` for how ours are found."
+    )
+    head = ["curves", "second phase from", "third", "fourth", "phases by their pattern"]
+    lines = section("Phases of experiment 5", head, rows, note)
+    returns, survival = (EXPERIMENT_5.curve(name) for name in ("collective_return", "survival_steps"))
+    rows = [["published curves", *_turning_cells(*returns, *survival)]]
+    for result in runs:
+        survival = result.smoothed("survival_steps")
+        episodes = np.arange(survival.shape[1])
+        returns = result.smoothed("collective_return").mean(0)
+        lowest = survival.min(1)
+        cells = _turning_cells(episodes, returns, episodes, survival.mean(0))
+        rows.append([result.name, *cells, f"{lowest.min():.0f} to {lowest.max():.0f}"])
+    head = ["curves", "highest return", "at episode", "lowest return after it", "at episode"]
+    head += [f"survival first below {SURVIVED} steps", "lowest survival", "lowest of single replicas"]
+    return [*lines, *section("Turning points of experiment 5", head, rows)]
 
 
-def draw_bands(panel: Axes, bands: Bands) -> None:
-    """Draw phases behind the curves of a panel."""
-    for first, last, name in bands:
-        if name != UNNAMED:  # which is white, and hatched in the strip alone
-            panel.axvspan(first, last, **_look(name, "#e6e6e6"), zorder=0, linewidth=0)
-        panel.axvline(last, color="#999999", linewidth=0.6, zorder=0.5)
+def _turning_cells(at: Float64, returns: Float64, survival_at: Float64, survival: Float64) -> list[str]:
+    top = int(returns.argmax())
+    bottom = top + int(returns[top:].argmin())
+    falls = survival < SURVIVED
+    first = f"{survival_at[falls.argmax()]:.0f}" if falls.any() else "never"
+    cells = [f"{returns[top]:.0f}", f"{at[top]:.0f}", f"{returns[bottom]:.0f}", f"{at[bottom]:.0f}"]
+    return [*cells, first, f"{survival.min():.0f}"]
 
 
-def add_keys(panel: Axes, *rows: Bands) -> None:
-    """Give a panel an entry for the legend of each phase in these bands, in the study's order."""
-    names = {name for bands in rows for _, _, name in bands}
-    for name in (known for known in COLOURS if known in names):
-        panel.add_patch(Rectangle((0, 0), 0, 0, label=f"phase: {name}", **_look(name, "#999999")))
+def _published_phases() -> list[Phase]:
+    episodes = np.arange(10, 4745)
+    # The curve of survival begins at episode 512; before that no agents deplete the board.
+    return find_phases(episodes, {name: EXPERIMENT_5.drawn_at(name, episodes) for name in METRICS})
 
 
-def _look(name: str, edge: str) -> dict[str, Any]:
-    hatch = {"hatch": "///"} if name == UNNAMED else {}
-    return {"facecolor": COLOURS[name], "edgecolor": edge, **hatch}
+def _change_intervals(result: Result) -> list[str]:
+    """Return in which episodes 95 % of the change points of resampled replicas lie; nothing for a single
+    replica.
 
-
-def draw_strip(sheet: Sheet, panel: Axes, rows: Mapping[str, Bands]) -> None:
-    """Draw rows of named blocks into a panel of its own, above that of the curves.
-
-    A name that is wider than its block is left to the legend of the bands.
+    Change points are no means, of which Student's t speaks: replicas are drawn anew, with replacement.
     """
-    low, high = panel.get_xlim()
-    for at, bands in enumerate(rows.values()):
-        for first, last, name in bands:
-            panel.barh(at, last - first, left=first, height=0.9, **_look(name, "#777777"))
-            if CHARACTER * len(name) < (last - first) / (high - low) * (sheet.width_em - 8):
-                box = {"facecolor": COLOURS[name], "edgecolor": "none", "pad": 1}
-                panel.text((first + last) / 2, at, name, ha="center", va="center", bbox=box)
-    panel.set(yticks=range(len(rows)), yticklabels=list(rows), ylim=(len(rows) - 0.5, -0.5))
-    panel.tick_params(left=False, bottom=False, labelbottom=False)
-    panel.spines[:].set_visible(False)
+    smoothed = {name: running_mean(result.curves[name]) for name in METRICS}
+    replicas, episodes = smoothed[METRICS[0]].shape
+    if replicas == 1:
+        return []
+    rng = np.random.default_rng(0)
+    resampled = []
+    for _ in range(_RESAMPLES):
+        drawn = rng.integers(replicas, size=replicas)
+        metrics = {name: curves[drawn] for name, curves in smoothed.items()}
+        resampled.append(change_points(np.arange(episodes), metrics))
+    return [f" [{low:.0f}, {high:.0f}]" for low, high in np.quantile(resampled, [0.025, 0.975], axis=0).T]
+
+
+def _phase_cells(divided: Sequence[Phase], intervals: Sequence[str] = ()) -> list[str]:
+    pairs = zip_longest(divided[1:], intervals, fillvalue="")
+    cells = [f"{phase.first:.0f}{interval}" for phase, interval in pairs]
+    return [*cells, ", ".join(phase.label or "none of them" for phase in divided)]

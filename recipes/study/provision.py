@@ -1,4 +1,4 @@
-"""Provision: does what helps appropriation help a commons that must be kept up, too?
+"""Does what helps appropriation help provision, too, a commons that must be kept up?
 
     python recipes/study/provision.py --jobs 1
 

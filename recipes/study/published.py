@@ -1,31 +1,23 @@
-"""The published results: the table of appendix A, training curves, and the windows of their running means.
+"""What did the study of 2019 publish? The table of appendix A, and training curves.
 
 Source: M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019), appendix A and the
-figures of its experiments, digitised at about 830 points each.
-
-The study does not say over how many episodes its running means are; the curves alone do. A running mean
-over w episodes has no power at the frequencies k / w: whole waves fit into the window, their mean is 0.
-Its increments are those of the episodes, w apart, so their spectrum is proportional to sin(pi f w)**2 if the
-episodes are white noise about a slow course. The window whose spectrum fits best, by the likelihood of
-P. Whittle ("Estimation and information in stationary time series", 1953), is the estimate.
+figures of its experiments, digitised at about 830 points each. The study does not say over how many episodes
+its running means are; docs/results/details.md says how the curves do.
 """
 
-import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+import pyarrow as pa
+from pyarrow import csv
 
 from cprl.commons.published import Board
-
-Values = NDArray[np.float64]
-
-PHASED_RECIPE: Final = "commons"
-"""Our recipe of experiment 5, the only one whose phases the study draws."""
+from cprl.measuring.table import where
+from cprl.values.array_types import Float64
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,10 +36,21 @@ class PublishedExperiment:
     episodes: int
     """The number of episodes in the study's figures."""
     window_episodes: int
-    """The window of the study's running means. It gives none: this one has its nulls where the spectra of the
-    published curves have theirs, see `estimate_window`."""
+    """The window of its running means: the one whose spectrum has its nulls where those of the published
+    curves have theirs."""
     curves: Mapping[str, str]
-    """The names of published curves by our name of the metric; `return_0` is the return of agent 0."""
+    """The experiment and the metric of published curves by our name of the metric; `return_0` is the return
+    of agent 0."""
+
+    def curve(self, metric: str) -> tuple[Float64, Float64]:
+        """Return the episodes and the values of a published curve, float64 [points] each."""
+        experiment, name = self.curves[metric].split("/")
+        points = where(_points(), experiment=experiment, metric=name)
+        return points["episode"].to_numpy(), points["value"].to_numpy()
+
+    def drawn_at(self, metric: str, episodes: Float64) -> Float64:
+        """Return a published curve at these episodes, between its points in straight lines."""
+        return np.interp(episodes, *self.curve(metric))
 
 
 EXPERIMENTS: Final = (
@@ -113,117 +116,16 @@ EXPERIMENTS: Final = (
 )
 
 
+EXPERIMENT_5: Final = EXPERIMENTS[-1]
+"""The only one whose phases the study draws."""
+
+
 def published_experiment(recipe: str) -> PublishedExperiment | None:
-    """The study's experiment that a recipe repeats, or None."""
+    """Return the study's experiment that a recipe repeats, or None."""
     return next((one for one in EXPERIMENTS if one.recipe == recipe), None)
 
 
-def curve(name: str) -> tuple[Values, Values]:
-    """A published curve: its episodes and its values, float64 [points] each.
-
-    Args:
-        name: as in `PublishedExperiment.curves`.
-    """
-    return _curves()[name]
-
-
 @cache
-def _curves() -> dict[str, tuple[Values, Values]]:
-    points: dict[str, list[tuple[float, float]]] = {}
-    with (Path(__file__).parent / "published_curves.csv").open(encoding="utf-8") as file:
-        for row in csv.DictReader(file):
-            name = f"{row['experiment']}/{row['metric']}"
-            points.setdefault(name, []).append((float(row["episode"]), float(row["value"])))
-    found = {name: np.array(sorted(of_curve)) for name, of_curve in points.items()}
-    return {name: (values[:, 0], values[:, 1]) for name, values in found.items()}
-
-
-def agreement(name: str, values: Values) -> tuple[float, float]:
-    """Pearson's correlation and the mean absolute difference between a curve of ours and a published one.
-
-    Args:
-        name: The name of the published curve.
-        values: Our curve, [E] from episode 0 on, smoothed in the same way. Only episodes that both curves
-            have are compared.
-
-    Raises:
-        ValueError: If the published curve has fewer than 10 points in these episodes.
-    """
-    episodes, published = curve(name)
-    both = episodes <= len(values) - 1
-    if both.sum() < 10:
-        raise ValueError(f"{len(values)} episodes have {both.sum()} points of {name}; allowed: at least 10")
-    ours = np.interp(episodes[both], np.arange(len(values)), values)
-    return float(np.corrcoef(ours, published[both])[0, 1]), float(np.abs(ours - published[both]).mean())
-
-
-WINDOWS: Final = tuple(range(15, 251, 5))
-"""The candidates, in episodes."""
-SLOWEST: Final = 0.002
-FASTEST: Final = 0.06
-"""The frequencies that are looked at, in waves per episode: slower ones are the course of learning, faster
-ones are lost where a figure has a point for every seventh episode."""
-NOISE: Final = 0.05
-"""The power that is left at a null, as a share of the largest: of reading points off a figure."""
-INDEPENDENT: Final = 1 / (1 + 2 * (4 / 9 + 1 / 36))
-"""The share of frequencies that count as independent. Under a Hann taper the powers of neighbouring ones are
-correlated by (2 / 3)**2, and those of the next but one by (1 / 6)**2."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class WindowEstimate:
-    """The window of a running mean, and how clearly it differs from others."""
-
-    window_episodes: int
-    """The candidate with the largest likelihood."""
-    nats: Mapping[int, float]
-    """By how much the logarithm of each candidate's likelihood falls short of the largest, at least 0."""
-
-    @property
-    def better_by_nats(self) -> float:
-        """The advantage over the next best candidate."""
-        return min(
-            (lost for window, lost in self.nats.items() if window != self.window_episodes), default=0.0
-        )
-
-
-def estimate_window(episodes: Values, values: Values, *, windows: Sequence[int] = WINDOWS) -> WindowEstimate:
-    """Estimates the window of a running mean.
-
-    Args:
-        episodes: the episode of each point, float [P], ascending; points may be unevenly spaced.
-        values: the running mean at each point, float [P]. Where in a window it is drawn does not matter.
-        windows: the candidates in episodes, at least 2 each; 15, 20 .. 250 by default.
-
-    Raises:
-        ValueError: if the episodes span fewer than four of the longest candidates.
-    """
-    if episodes[-1] - episodes[0] < 4 * max(windows):
-        raise ValueError(
-            f"episodes are {episodes[0]:g} to {episodes[-1]:g}; allowed: at least {4 * max(windows)}, four "
-            "of the longest candidates"
-        )
-    power, frequency = _spectrum(episodes, values)
-    costs = {window: _cost(power, frequency, window) for window in windows}
-    best = min(costs, key=lambda window: costs[window])
-    return WindowEstimate(
-        window_episodes=best, nats={window: cost - costs[best] for window, cost in costs.items()}
-    )
-
-
-def _spectrum(at: Values, curve: Values) -> tuple[Values, Values]:
-    """The power of the curve's increments between episodes, and its frequencies, those looked at."""
-    every = np.arange(np.ceil(at[0]), at[-1])
-    steps = np.diff(np.interp(every, at, curve))
-    power = np.abs(np.fft.rfft(steps * np.hanning(len(steps)))) ** 2
-    frequency = np.asarray(np.fft.rfftfreq(len(steps)), np.float64)
-    seen = (frequency > SLOWEST) & (frequency < FASTEST)
-    return power[seen], frequency[seen]
-
-
-def _cost(power: Values, frequency: Values, window: int) -> float:
-    """Minus the logarithm of Whittle's likelihood at the best scale of the spectrum, up to a constant."""
-    expected = np.sin(np.pi * frequency * window) ** 2 + NOISE
-    with np.errstate(divide="ignore"):
-        cost = np.log((power / expected).mean()) + np.log(expected).mean()
-    return float(INDEPENDENT * len(power) * cost)
+def _points() -> pa.Table:
+    table = csv.read_csv(Path(__file__).parent / "published_curves.csv")
+    return table.sort_by([("episode", "ascending"), ("value", "ascending")])

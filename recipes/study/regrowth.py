@@ -3,18 +3,19 @@
 python recipes/study/regrowth.py --jobs 2
 """
 
+import numpy as np
 from base import EXPERIMENT
 
 import cprl
 
-PROBS = EXPERIMENT.game.rules.regrow_prob
+PROBS = np.array(EXPERIMENT.game.rules.regrow_prob)
 TIMES = (0.25, 0.5, 1.0, 2.0, 4.0)
 
 STUDY = cprl.Study(
     EXPERIMENT,
     {
         "regrowth": {
-            f"{times:g}": {"game.rules.regrow_prob": tuple(times * prob for prob in PROBS)} for times in TIMES
+            f"{times:g}": {"game.rules.regrow_prob": tuple((times * PROBS).tolist())} for times in TIMES
         }
     },
     reference="regrowth=1",

@@ -1,4 +1,4 @@
-"""The study's five experiments, run one after the other and reported beside the published figures.
+"""Do the study's five experiments come out again? All are run, and reported beside the published figures.
 
     python recipes/study/reproduce.py --runs ~/cprl-runs --results docs/results
 
@@ -20,7 +20,7 @@ from typing import Literal
 import tyro
 from report import write_report
 
-from cprl.commands.recipe import in_a_sentence
+from cprl.commands.recipe_command import exit_with_message
 from cprl.runs.export import export_results
 from cprl.system.output import say
 from cprl.system.process import prepare_process
@@ -54,7 +54,7 @@ def main(
     processes: int | None = None,
     engine: Literal["compiled", "eager"] = "compiled",
 ) -> Path:
-    """Runs experiments, keeps their results, and returns the report.
+    """Run experiments, keep their results, and return the report.
 
     Args:
         runs: where run directories are made, and resumed; some gigabytes while they train.
@@ -69,7 +69,8 @@ def main(
         if name not in EXPERIMENTS:
             raise ValueError(f"there is no experiment {name!r}; allowed: {', '.join(EXPERIMENTS)}")
     common = ["--replicas", str(replicas), "--engine", engine]
-    common += [] if episodes is None else ["--episodes", str(episodes)]
+    if episodes is not None:
+        common += ["--episodes", str(episodes)]
     run_all(only, common, runs=runs, results=results, processes=processes)
     prepare_process(0)
     return write_report([results / name for name in only], results)
@@ -78,10 +79,10 @@ def main(
 def run_all(
     names: Sequence[str], common: Sequence[str], *, runs: Path, results: Path, processes: int | None
 ) -> None:
-    """Runs experiments, some at once; after Ctrl-C or once one has failed, those that wait are not begun."""
+    """Run experiments, some at once; after Ctrl-C or once one has failed, those that wait are not begun."""
     is_over = Event()
 
-    def one(name: str) -> None:
+    def run_next(name: str) -> None:
         if is_over.is_set():
             return
         try:
@@ -92,14 +93,14 @@ def run_all(
 
     with ThreadPoolExecutor(processes or os.cpu_count()) as pool:
         try:
-            for ended in [pool.submit(one, name) for name in names]:
+            for ended in [pool.submit(run_next, name) for name in names]:
                 ended.result()
         finally:
             is_over.set()
 
 
 def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
-    """Runs an experiment in a process of its own, or resumes it, and keeps its results.
+    """Run an experiment in a process of its own, or resume it, and keep its results.
 
     What is finished is resumed too: its recipe refuses a run of another one, and then has nothing to do.
 
@@ -107,14 +108,15 @@ def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
         ChildProcessError: if it fails or is stopped; ends with the last line of its log.
     """
     recipe, *arguments = EXPERIMENTS[name]
-    directory, log = runs / name, runs / f"{name}.log"
+    directory = runs / name
+    log = runs / f"{name}.log"
     runs.mkdir(parents=True, exist_ok=True)
-    command = [sys.executable, str(recipe_named(recipe).path), *arguments, *common]
-    command += ["--out", str(directory)]
-    command += ["--resume"] if (directory / "recipe.json").exists() else []
+    command = [sys.executable, str(recipe_named(recipe).path), *arguments, *common, "--out", str(directory)]
+    if (directory / "recipe.json").exists():
+        command.append("--resume")
     say(f"{name}: see {log}")
-    with open(log, "a") as told:
-        done = subprocess.run(command, stdout=told, stderr=subprocess.STDOUT, check=False)
+    with open(log, "a") as output:
+        done = subprocess.run(command, stdout=output, stderr=subprocess.STDOUT, check=False)
     if done.returncode or not (directory / "report.json").exists():
         *_, last = ["", *log.read_text(encoding="utf-8", errors="replace").splitlines()]
         raise ChildProcessError(f"{name} ended with {done.returncode} and is not finished; see {log}: {last}")
@@ -122,5 +124,5 @@ def run(name: str, common: Sequence[str], *, runs: Path, results: Path) -> None:
 
 
 if __name__ == "__main__":
-    with in_a_sentence("reproduce.py"):
+    with exit_with_message("reproduce.py"):
         say(tyro.cli(main))

@@ -1,4 +1,4 @@
-"""Rules that the study names and never ran: one who may punish, fines for regions, a penalty that is certain.
+"""Do the rules help that the study names and never ran? One may punish, fines for regions, a sure penalty.
 
 python recipes/study/rules.py --jobs 2
 """
@@ -12,7 +12,7 @@ BOARD = EXPERIMENT.game.map
 
 
 def under(*institutions: Institution, **rules: object) -> dict[str, object]:
-    """A condition: institutions, and rules of the game that differ."""
+    """Return a condition of institutions, and of rules of the game that differ."""
     return {"game.institutions": institutions} | {
         f"game.rules.{name}": value for name, value in rules.items()
     }

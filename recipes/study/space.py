@@ -3,6 +3,7 @@
 python recipes/study/space.py --jobs 2
 """
 
+from dataclasses import replace
 from typing import Literal
 
 from base import EXPERIMENT
@@ -18,36 +19,33 @@ CORNERS = ((0, 1, 1), (0, 22, 2), (11, 1, 0), (11, 22, 3))
 
 
 def scattered(times: float, clustering: float = 0.0) -> Map:
-    """A random board of the size of commons with so many times its sites."""
+    """Return a random board of the size of commons with so many times its sites."""
     return maps.random(
         BOARD.height, BOARD.width, agents=4, density=times * DENSITY, clustering=clustering, seed=0
     )
 
 
 def boards(copies: int) -> Map:
-    """Commons and its copies one below the other; the agents start in the first."""
-    return Map(
-        height=BOARD.height * copies,
-        width=BOARD.width,
-        sites=tuple((row + BOARD.height * nth, col) for nth in range(copies) for row, col in BOARD.sites),
-        starts=BOARD.starts,
-    )
+    """Return commons and its copies one below the other; the agents start in the first."""
+    tops = range(0, BOARD.height * copies, BOARD.height)
+    sites = tuple((top + row, col) for top in tops for row, col in BOARD.sites)
+    return replace(BOARD, height=BOARD.height * copies, sites=sites)
 
 
 def half() -> Map:
-    """The left half of commons, with its starts."""
+    """Return the left half of commons, with its starts."""
     width = BOARD.width // 2
-    sites = tuple((row, col) for row, col in BOARD.sites if col < width)
-    return Map(height=BOARD.height, width=width, sites=sites, starts=BOARD.starts)
+    return replace(BOARD, width=width, sites=tuple(site for site in BOARD.sites if site[1] < width))
 
 
 def quarters(between: Literal["ground", "doors", "walls"]) -> Map:
-    """The quarters of commons apart by a row and a column, with an agent in each.
+    """Return the quarters of commons apart by a row and a column, with an agent in each.
 
     Args:
         between: what lies there: open ground, walls with a door in each of the four, or walls.
     """
-    row, col = BOARD.height // 2, BOARD.width // 2
+    row = BOARD.height // 2
+    col = BOARD.width // 2
 
     def moved(cell: tuple[int, ...]) -> tuple[int, ...]:
         return cell[0] + (cell[0] >= row), cell[1] + (cell[1] >= col), *cell[2:]

@@ -21,34 +21,35 @@ FACTORS: Final = ("quota", "boundaries", "monitoring", "sanctions", "vote", "sig
 """The last three are products of the first four: vote = quota x boundaries x monitoring, sight = boundaries x
 monitoring x sanctions, few = quota x monitoring x sanctions."""
 FINE: Final = 1.0
-"""Of a forbidden bite, in apples: what it brings."""
+"""The fine of a forbidden bite, in apples: what the bite brings."""
 
 
 def design() -> list[dict[str, bool]]:
-    """Whether each factor is at its high level, by condition."""
-    found = []
+    """Return whether each factor is at its high level, for each condition."""
+    conditions = []
     for basis in product((False, True), repeat=4):
         q, b, m, s = (1 if high else -1 for high in basis)
-        generated = q * b * m > 0, b * m * s > 0, q * m * s > 0
-        found.append(dict(zip(FACTORS, (*basis, *generated), strict=True)))
-    return found
+        generated = (q * b * m > 0, b * m * s > 0, q * m * s > 0)
+        conditions.append(dict(zip(FACTORS, (*basis, *generated), strict=True)))
+    return conditions
 
 
 def condition(levels: dict[str, bool]) -> dict[str, Any]:
-    """What differs from the experiment.
+    """Return what differs from the experiment.
 
     Rules can be broken and cost a fine where detected, one turn in five, or always where it is monitored;
     sanctions add time-outs and fines that grow; a vote sets a tax; sight is 11 x 23 cells in place of 7 x
     15; few are two agents in place of four.
     """
     agents = 2 if levels["few"] else 4
+    detection_prob = 1.0 if levels["monitoring"] else 0.2
     board = crowded(agents)
     quota = Quota(share=0.25, window_steps=50, fine=FINE)
     boundaries = Boundaries.strips(height=board.height, width=board.width, agents=agents, bite_fine=FINE)
     rules = [rule for rule, name in ((quota, "quota"), (boundaries, "boundaries")) if levels[name]]
     sanctions = GraduatedSanctions(freeze_steps=(5, 25, 100, 100), fines=(0, 1, 2, 4), on="violations")
     if rules:
-        rules.append(Monitoring(prob=1.0 if levels["monitoring"] else 0.2))
+        rules.append(Monitoring(prob=detection_prob))
         rules += [sanctions] * levels["sanctions"]
     rules += [Vote(on=Tax(), choices=(0.0, 0.25, 0.5, 0.75))] * levels["vote"]
     rows, columns = (11, 23) if levels["sight"] else (7, 15)
@@ -62,7 +63,7 @@ def condition(levels: dict[str, bool]) -> dict[str, Any]:
 
 
 def name(levels: dict[str, bool]) -> str:
-    """The factors that are at their high level.
+    """Return the factors that are at their high level.
 
     Without a quota or boundaries those named monitoring and sanctions are not in the game, see `condition`.
     """

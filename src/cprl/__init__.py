@@ -22,9 +22,9 @@ A package imports only from those above it:
     terminal     progress, summary, figures
     training     the loop: act, store, update, measure, record; run, load
     evaluation   stored agents in fresh worlds: alone, among each other and people
-    studies      one experiment under many conditions: factors, trials, tables, figures; best responses
-    experimental  the waiting room, which may change: empirical games, territory
+    studies      one experiment under many conditions: factors, trials, tables, figures
     commands     the command line
+    experimental  the waiting room, which may change and which no other package imports
 """
 
 from importlib import import_module
@@ -51,7 +51,7 @@ if TYPE_CHECKING:
         training,
         viewer,
     )
-    from cprl.commands.recipe import recipe_main
+    from cprl.commands.recipe_command import recipe_main
     from cprl.commands.studies import study_main
     from cprl.commons import maps
     from cprl.commons.game import Game
@@ -141,7 +141,7 @@ _MODULES: Final = {
     "evaluate_run": "cprl.evaluation",
     "gains": "cprl.evaluation",
     "load": "cprl.training.stored",
-    "recipe_main": "cprl.commands.recipe",
+    "recipe_main": "cprl.commands.recipe_command",
     "run": "cprl.training.running",
     "run_study": "cprl.studies",
     "study_main": "cprl.commands.studies",

@@ -1,7 +1,8 @@
-"""How each agent of a population is specified: plain values.
+"""Specifications of agents: `Learning`, `Team`, `Scripted` and `Frozen`, the values that an experiment's
+`agents` holds.
 
-A population is a sequence of specifications. A `Team` stands once and names its agents; the others take the
-remaining agent indices in order.
+A population is a sequence of specifications. A `Team` stands once and names its agents; the other
+specifications stand for one agent each and take the remaining agent indices in order.
 """
 
 import os
@@ -11,33 +12,42 @@ from posixpath import normpath
 from typing import Annotated, Any, Final, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
-from cprl.learners.settings import Exploring
+from cprl.learners.settings import EpsilonGreedy
 from cprl.objectives.rewards import Reward
 from cprl.policies.decisions import Bandit
 from cprl.policies.scripted import ScriptedPolicy
 from cprl.values import AgentIndices, Custom, Natural, Value, Where, checked
 
+_LONGEST_PATH_BYTES: Final = 4095
+"""The longest path that Linux takes."""
+
 
 def _is_path(value: Any) -> bool:
+    """Return whether a value is a string that the operating system can take for a path."""
     try:
-        return isinstance(value, str) and "\0" not in value and 0 < len(os.fsencode(value)) <= _MOST_PATH
+        return (
+            isinstance(value, str)
+            and "\0" not in value
+            and 0 < len(os.fsencode(value)) <= _LONGEST_PATH_BYTES
+        )
     except UnicodeEncodeError:
         return False
 
 
-_MOST_PATH: Final = 4095
-RunPath = Annotated[str, Where(_is_path, f"the path of a run's directory, up to {_MOST_PATH} bytes")]
+RunPath = Annotated[str, Where(_is_path, f"the path of a run's directory, up to {_LONGEST_PATH_BYTES} bytes")]
 
 
 @dataclass(frozen=True)
 class Frozen(Value):
-    """What an agent of an earlier run learned: an agent that plays it, or what another one starts from.
+    """An agent of an earlier run. It plays as it has learned there and learns nothing more; or, as
+    `start_from` of another agent, gives that agent its initial weights.
 
     Args:
         run: the directory of the run, or of its results.
         agent: the index of the agent in that run.
-        replica: the replica of that run; None for the replica of the same number in each replica; or one for
-            each replica here, e.g. (0, 1, 0, 1) where four play against two.
+        replica: the replica of that run whose agent plays in all replicas here; None for the replica of the
+            same index as here; or one replica of that run for each replica here, e.g. (0, 1, 0, 1) if four
+            replicas play with agents of two.
     """
 
     run: RunPath
@@ -48,9 +58,11 @@ class Frozen(Value):
         if isinstance(self.run, os.PathLike):
             object.__setattr__(self, "run", os.fspath(self.run))
         super().__post_init__()
-        object.__setattr__(self, "run", normpath(self.run))  # of "runs/x/" and "runs/x", the same checksum
+        # "runs/x/" and "runs/x" are equal values, so recipes that differ in nothing else are equal too.
+        object.__setattr__(self, "run", normpath(self.run))
 
     def replica_for(self, replica: int) -> int:
+        """Return the index of the earlier run's replica whose agent plays in a replica here."""
         if not isinstance(self.replica, tuple):
             return replica if self.replica is None else self.replica
         if replica >= len(self.replica):
@@ -63,15 +75,16 @@ class Frozen(Value):
 
 @dataclass(frozen=True)
 class Learning(Value):
-    """An agent that learns on its own. Equal ones are updated together, as lanes of one engine.
+    """An agent that learns independently of the others. Agents with equal specifications are computed
+    together, which changes no result.
 
     Args:
-        algorithm: e.g. `cprl.algorithms.DQN(settings=...)`.
-        reward: what it wants: "individual", its own reward; "team", the sum of the rewards of all agents of
-            the game; or a value of `cprl.objectives.rewards`, e.g. `Exchange(0.5)`.
-        start_from: the agent whose weights its acting network, and the target of it, start with; None for
-            new ones. The optimiser, critics, exploration and decisions begin anew.
-        decisions: how it learns what it decides, in a game with votes or elections; None for `Bandit()`.
+        algorithm: the algorithm with its settings, e.g. `cprl.algorithms.DQN(settings=...)`.
+        reward: the reward that it learns from: "individual", its own; "team", the sum of the rewards of all
+            agents of the game; or a value of `cprl.objectives.rewards`, e.g. `Exchange(0.5)`.
+        start_from: the agent with whose weights its acting network and that network's target start; None for
+            new weights. The optimiser, critics, exploration and decisions always begin anew.
+        decisions: how it learns to vote, in a game with votes or elections; None for `Bandit()`.
     """
 
     algorithm: Algorithm | Custom
@@ -90,19 +103,20 @@ class Learning(Value):
 
 @dataclass(frozen=True)
 class Team(Value):
-    """Agents that learn together; a team in every replica.
+    """Agents that learn together, as a team in each replica.
 
     Args:
-        algorithm: e.g. `cprl.algorithms.QMIX(settings=...)`; with `share_parameters` also one of independent
-            agents, e.g. `DQN(settings=...)`.
-        agents: their indices, ascending.
-        reward: "team", the sum of the rewards of all agents of the game; for IPPO, LOLA, MADDPG and those of
-            independent agents also what each member wants by itself, see `Learning`.
-        start_from: a member of a team of the same size; each member starts with the weights of the member
-            at the same place in that team, see `Learning`. Mixers and central critics begin anew.
-        decisions: how each member learns what it decides, by itself; see `Learning`.
-        share_parameters: whether the members share one network, of actions and, where the algorithm has
-            one for each member, of values; it learns from the transitions of all of them.
+        algorithm: an algorithm of teams, e.g. `cprl.algorithms.QMIX(settings=...)`; with `share_parameters`
+            also an algorithm of independent agents, e.g. `DQN(settings=...)`.
+        agents: the indices of the members, ascending.
+        reward: "team", the sum of the rewards of all agents of the game. IPPO, LOLA, MADDPG and algorithms of
+            independent agents also take any other reward of `Learning`, for each member.
+        start_from: a member of a team of the same size, in an earlier run; each member starts with the
+            weights of the member at the same position in that team, see `Learning`. Mixers and central
+            critics begin anew.
+        decisions: how each member learns to vote, independently of the others, see `Learning`.
+        share_parameters: whether the members share their acting network, and their critic if the algorithm
+            has one for each member. The shared networks learn from the transitions of all members.
     """
 
     algorithm: Algorithm | Custom
@@ -121,6 +135,7 @@ class Team(Value):
 
 
 def refuse_sharing(algorithm: Algorithm, share_parameters: bool) -> None:
+    """Raise a ValueError if parameters are to be shared, and the algorithm does not support that."""
     if share_parameters and not algorithm.can_share_parameters:
         raise ValueError(
             f"Team.share_parameters is True; allowed for {type(algorithm).__name__}, whose agents each have "
@@ -136,21 +151,30 @@ class Scripted(Value):
 
 
 AgentSpec: TypeAlias = Learning | Team | Scripted | Frozen
+"""The specification of an agent, or of a team."""
 
 
 def any_learns(specs: Sequence[AgentSpec]) -> bool:
-    """Return whether an agent learns."""
+    """Return whether any agent of a population learns."""
     return any(isinstance(spec, Learning | Team) for spec in specs)
 
 
 def learned(by_agent: Sequence[AgentSpec]) -> str:
-    """Who plays and how they learned, of `specs_by_agent`, e.g. "4 agents by DQN"."""
-    names = [_kind(spec) for spec in by_agent]
-    counts = {name: names.count(name) for name in names}
-    return ", ".join(f"{count} agent{'s' * (count > 1)} {name}" for name, count in counts.items())
+    """Return how the agents of a population learned, in words: "4 agents by DQN, 1 agent by the script
+    'greedy'".
+
+    Args:
+        by_agent: the specification of each agent, see `specs_by_agent`.
+    """
+    descriptions = [_describe(spec) for spec in by_agent]
+    counts = {description: descriptions.count(description) for description in descriptions}
+    return ", ".join(
+        f"{count} agent{'s' * (count > 1)} {description}" for description, count in counts.items()
+    )
 
 
-def _kind(spec: AgentSpec) -> str:
+def _describe(spec: AgentSpec) -> str:
+    """Return how an agent learned, in words that follow "agent", e.g. "by QMIX as a team"."""
     match spec:
         case Learning() | Team():
             team = " as a team" if isinstance(spec, Team) else ""
@@ -165,7 +189,11 @@ def _kind(spec: AgentSpec) -> str:
 
 
 def specs_by_agent(specs: Sequence[AgentSpec], agents: int) -> list[AgentSpec]:
-    """The specification of each of N agents; that of a team for each of its members."""
+    """Return the specification of each of N agents; each member of a team has the team's.
+
+    Raises:
+        ValueError: if an agent has two specifications or none, or is not in the game.
+    """
     by_agent: dict[int, AgentSpec] = {}
     for spec in specs:
         for agent in spec.agents if isinstance(spec, Team) else ():
@@ -174,75 +202,82 @@ def specs_by_agent(specs: Sequence[AgentSpec], agents: int) -> list[AgentSpec]:
             if agent >= agents:
                 raise ValueError(f"a team has agent {agent}; the game has the agents 0 to {agents - 1}")
             by_agent[agent] = spec
-    alone = [spec for spec in specs if not isinstance(spec, Team)]
-    left = [agent for agent in range(agents) if agent not in by_agent]
-    if len(alone) != len(left):
+    single_specs = [spec for spec in specs if not isinstance(spec, Team)]
+    remaining_agents = [agent for agent in range(agents) if agent not in by_agent]
+    if len(single_specs) != len(remaining_agents):
         raise ValueError(
-            f"{len(alone) + len(by_agent)} agents are specified for a game of {agents} agents; "
+            f"{len(single_specs) + len(by_agent)} agents are specified for a game of {agents} agents; "
             "allowed: one specification for each"
         )
-    by_agent.update(zip(left, alone, strict=True))
+    by_agent.update(zip(remaining_agents, single_specs, strict=True))
     return [by_agent[agent] for agent in range(agents)]
 
 
 def refuse_undecided(specs: Sequence[AgentSpec], ballots: int) -> None:
-    for place, spec in enumerate(specs):
+    """Raise a ValueError if an agent says how it learns to vote, in a game without ballots."""
+    for index, spec in enumerate(specs):
         if isinstance(spec, Learning | Team) and spec.decisions is not None and not ballots:
             raise ValueError(
-                f"agents[{place}].decisions is {spec.decisions}; allowed in a game without votes and "
+                f"agents[{index}].decisions is {spec.decisions}; allowed in a game without votes and "
                 "elections: None"
             )
 
 
 def grouped(specs: Sequence[AgentSpec], agents: int) -> list[tuple[AgentSpec, tuple[int, ...]]]:
-    """Each specification with the indices of its agents: equal ones together, each team by itself, in the
-    order of their first agents.
+    """Return each specification once, with the indices of all agents that have it, by their first agent.
+
+    Each team is a group of its own, also beside an equal one.
     """
     by_agent = specs_by_agent(specs, agents)
     groups: list[tuple[AgentSpec, tuple[int, ...]]] = []
     for agent, spec in enumerate(by_agent):
-        if not any(agent in members for _, members in groups):
-            members = (
-                spec.agents
-                if isinstance(spec, Team)
-                else tuple(other for other, of_other in enumerate(by_agent) if of_other == spec)
-            )
-            groups.append((spec, members))
+        if any(agent in members for _, members in groups):
+            continue
+        if isinstance(spec, Team):
+            groups.append((spec, spec.agents))
+        else:
+            equal_agents = tuple(index for index in range(agents) if by_agent[index] == spec)
+            groups.append((spec, equal_agents))
     return groups
 
 
 def exploration_steps(specs: Sequence[AgentSpec]) -> int | None:
-    """The environment step of a replica at which the last agent's epsilon has reached its end; None if no
-    agent explores by epsilon, or only by an algorithm of the user's own."""
-    ends = [
+    """Return the environment step of a replica from which on every agent's epsilon stays at its end.
+
+    Return None if no agent has an epsilon that falls. A user's own algorithm does not count.
+    """
+    end_steps = [
         settings.epsilon_hold_steps + settings.epsilon_decay_steps
         for settings in exploring(specs)
         if settings.epsilon_end < settings.epsilon_start
     ]
-    return max(ends, default=None)
+    return max(end_steps, default=None)
 
 
-def exploring(specs: Sequence[AgentSpec]) -> list[Exploring]:
-    """Return the settings of agents who explore by epsilon, but for those of the user's own algorithms."""
-    learners = [spec.algorithm for spec in specs if isinstance(spec, Learning | Team)]
-    settings = [one.settings for one in learners if isinstance(one, Algorithm) and not one.stochastic]
-    return [one for one in settings if isinstance(one, Exploring)]
+def exploring(specs: Sequence[AgentSpec]) -> list[EpsilonGreedy]:
+    """Return the settings of agents that explore epsilon-greedily; a user's own algorithms do not count."""
+    algorithms = [spec.algorithm for spec in specs if isinstance(spec, Learning | Team)]
+    greedy = [
+        algorithm for algorithm in algorithms if isinstance(algorithm, Algorithm) and not algorithm.stochastic
+    ]
+    return [algorithm.settings for algorithm in greedy if isinstance(algorithm.settings, EpsilonGreedy)]
 
 
 def partners_in(specs: Iterable[AgentSpec]) -> list[str]:
-    """Return the runs whose agents play among some specifications."""
+    """Return the directories of the earlier runs whose frozen agents play in a population, sorted."""
     return sorted({spec.run for spec in specs if isinstance(spec, Frozen)})
 
 
 def stored_of(spec: Any) -> Frozen | None:
-    """The stored agent that plays or that is started from; None where there is none."""
+    """Return the agent of an earlier run that a specification names, to play or to start from; None if it
+    names none."""
     return spec if isinstance(spec, Frozen) else getattr(spec, "start_from", None)
 
 
-def with_stored(spec: Any, changed: Callable[[Frozen], Frozen]) -> Any:
-    """A specification of an agent with another stored agent in place of its own, if it has one."""
+def with_stored(spec: Any, change: Callable[[Frozen], Frozen]) -> Any:
+    """Return a specification after a change of the agent of an earlier run that it names, if it names one."""
     if isinstance(spec, Frozen):
-        return changed(spec)
+        return change(spec)
     if isinstance(spec, Learning | Team) and spec.start_from is not None:
-        return replace(spec, start_from=changed(spec.start_from))
+        return replace(spec, start_from=change(spec.start_from))
     return spec

@@ -11,14 +11,18 @@ from pathlib import Path
 from golden import OWN_ALGORITHMS, RESULTS, WITH_THE_FAULT, checksum, columns
 
 import cprl
-from cprl.measuring.table import numbers_in, where
+from cprl.measuring.table import all_metrics, complete, where
 
 TEN_TARGETS = "commons_targets_10"
 cprl.trust(*OWN_ALGORITHMS)
 
 
 def runs() -> dict[str, Path]:
-    """The stored runs that keep weights and whose game can be played, by their path below docs/results."""
+    """The stored runs that keep weights and whose game can be played, by their path below docs/results.
+
+    stored.json also holds four runs whose weights left docs/results after commit c9708fc0: `git checkout
+    c9708fc0 -- docs/results` brings them back, and then they are played again.
+    """
     found = sorted(path.parents[1] for path in RESULTS.rglob("checkpoints/*.pt"))
     by_path = {path.relative_to(RESULTS).as_posix(): path for path in found}
     return {path: run for path, run in by_path.items() if run / "recipe.json" not in WITH_THE_FAULT}
@@ -38,7 +42,7 @@ def evaluated() -> dict[str, object]:
             found[label] = columns(played)
             trained = where(played, policy="trained")
             agents = range(len(trained["agent"].unique()))
-            numbers = [*numbers_in(trained), *(f"agent_{agent}/return" for agent in agents)]
+            numbers = [*all_metrics(trained), *(f"agent_{agent}/return" for agent in agents)]
             found[f"{label}, estimates"] = {
                 metric: [estimate.value, estimate.low, estimate.high]
                 for (metric,), estimate in cprl.estimates(trained, numbers).items()
@@ -59,7 +63,7 @@ def crossed() -> dict[str, object]:
 
 def schelling() -> dict[str, object]:
     from cprl import presets
-    from cprl.evaluation import schelling
+    from cprl.experimental.schelling import schelling
 
     boards = {board: presets.game(board, variant="as_run") for board in ("two_complex", "commons")}
     return {board: columns(schelling(game, twice())) for board, game in boards.items()}
@@ -76,7 +80,7 @@ def scenarios() -> dict[str, object]:
 
 def territory() -> dict[str, object]:
     import cprl
-    from cprl.experimental.territory import WORDS, maps_of, territory_of
+    from cprl.experimental.territory import TERRITORY_NUMBERS, maps_of, territory_of
     from cprl.measuring.table import where
 
     names = {"visits": "visits", "taggings": "tags_by_agent", "tagged_where": "tags_by_cell"}
@@ -86,7 +90,7 @@ def territory() -> dict[str, object]:
         board = cprl.load(RESULTS / name).game.map
         for policy in ("trained", "random"):
             rows = where(table, policy=policy, agent=0).sort_by("replica")
-            numbers = {words: rows[number].to_pylist() for number, words in WORDS.items()}
+            numbers = {words: rows[number].to_pylist() for number, words in TERRITORY_NUMBERS.items()}
             arrays = {key: maps_of(table, column, policy) for key, column in names.items()}
             for key in ("visits", "tagged_where"):
                 arrays[key] = arrays[key].reshape(*arrays[key].shape[:2], board.height, board.width)
@@ -100,7 +104,7 @@ def responses() -> dict[str, object]:
     import pyarrow.parquet as pq
 
     tables = sorted((RESULTS / "exploitability").glob("*.parquet"))
-    return {path.stem: columns(pq.read_table(path)) for path in tables}
+    return {path.stem: columns(complete(pq.read_table(path))) for path in tables}
 
 
 KINDS = {kind.__name__: kind for kind in (evaluated, crossed, schelling, scenarios, territory, responses)}

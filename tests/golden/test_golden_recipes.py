@@ -11,12 +11,12 @@ from typing import get_args
 
 import pytest
 from golden import RESULTS, WITH_THE_FAULT, assert_held
+from places import ROOT
 
 from cprl import Experiment, Study
 from cprl.experiment.engine import engine_of
 from cprl.values import trust
 
-ROOT = Path(__file__).parents[2]
 RECIPES = sorted(path for path in (ROOT / "recipes").rglob("*.py"))
 STORED = sorted({*RESULTS.rglob("recipe.json")} - WITH_THE_FAULT)
 STUDIES = sorted({*RESULTS.rglob("study.json")} - WITH_THE_FAULT)

@@ -3,13 +3,11 @@
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 from golden import IS_X86, LIKE_EVERY_MACHINE
+from places import RESULTS, ROOT
 
-ROOT = Path(__file__).parents[2]
-RESULTS = ROOT / "docs" / "results"
 COMMONS, TARGETS_10 = "commons", "commons_targets_10"
 REPORTS = {
     "studies/dip/report": [

@@ -2,17 +2,15 @@
 
 import re
 import shutil
-from pathlib import Path
 
 import pytest
+from places import RESULTS
 
-import cprl
 from cprl.studies import StudyTable
 from cprl.studies.results import write_summary
-from cprl.studies.tables.comparing import cells
-from cprl.terminal.tables import markdown
+from cprl.studies.tables.comparing import condition_table
+from cprl.terminal.text_tables import markdown
 
-RESULTS = Path(cprl.__file__).parents[2] / "docs" / "results"
 STUDIES = sorted(path.parent for path in RESULTS.rglob("summary.md"))
 
 
@@ -33,7 +31,7 @@ def test_a_summary_holds_what_its_table_gives(study):
     table = StudyTable.read(study / "table.parquet", last=last_of(summary))
     for part in ("training", "evaluation", "random"):
         for kind in ("levels", "differences") if part != "random" else ("levels",):
-            lines = markdown(cells(table, (), kind, part=part))
+            lines = markdown(condition_table(table, (), kind, part=part))
             assert len(lines) > 3
             assert set(lines) <= set(summary), (part, kind)
 

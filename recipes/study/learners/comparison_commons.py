@@ -21,7 +21,7 @@ CHOSEN = {
     "PR2": "learning rate 0.001, temperature 0.1",
     "LOLA": "learning rate 0.001, look ahead rate 0.01",
 }
-"""What tuning_commons.py chose; its table is in docs/results/learners."""
+"""The candidates that tuning_commons.py chose; its table is in docs/results/learners."""
 
 EPISODES = {
     "": 1100,

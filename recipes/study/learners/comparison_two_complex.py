@@ -21,7 +21,7 @@ CHOSEN = {
     "PR2": "learning rate 0.001, temperature 0.1",
     "LOLA": "learning rate 0.01, look ahead rate 0.01",
 }
-"""What tuning_two_complex.py chose; its table is in docs/results/learners."""
+"""The candidates that tuning_two_complex.py chose; its table is in docs/results/learners."""
 
 EPISODES = {
     "": 1500,

@@ -3,14 +3,11 @@
 python recipes/study/learners/tuning_two_complex.py --jobs 2
 """
 
-from ways import tuning, winners
+from ways import print_winners, tuning
 
 import cprl
-from cprl.studies import StudyTable
 
 STUDY = tuning("two_complex")
 
 if __name__ == "__main__":
-    TABLE = cprl.study_main(STUDY) / "table.parquet"
-    for way, candidate in winners(StudyTable.read(TABLE)).items() if TABLE.exists() else ():
-        print(f"{way}: {candidate}")
+    print_winners(cprl.study_main(STUDY) / "table.parquet")

@@ -1,12 +1,13 @@
-"""Nine ways to learn on two boards: what is compared, and with which settings.
+"""Which ways to learn are compared on two boards, and with which settings?
 
 Each way has four candidates for its settings, the same number for all, and they are chosen on seeds that the
 comparison does not use: tuning_BOARD.py beside this file trains every candidate and prints which one won.
 """
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import replace
 from itertools import product
+from pathlib import Path
 from typing import Any, Final, Literal
 
 import cprl
@@ -37,122 +38,76 @@ GAMMA: Final = 0.99
 """The discount factor of all, since it says what agents want and not how they learn."""
 STEPS: Final = 1_000_000
 """Environment steps of each replica, at least; look-ahead rollouts are such steps."""
-
-
-def replay(learning_rate: float, *, steps: int, **more: Any) -> DQNSettings:
-    """Settings of whatever learns from replay; exploration decays over the first half of the training."""
-    return DQNSettings(
-        gamma=GAMMA,
-        learning_rate=learning_rate,
-        buffer_size=50_000,
-        epsilon_decay_steps=steps // 2,
-        **more,
-    )
-
-
-def rollouts(learning_rate: float) -> RolloutSettings:
-    """Settings of whatever learns from rollouts."""
-    return RolloutSettings(gamma=GAMMA, learning_rate=learning_rate)
-
-
-@dataclass(frozen=True)
-class Way:
-    """A way to learn: the two values of each of two settings, and the algorithm with one of each."""
-
-    grid: dict[str, tuple[Any, Any]]
-    make: Callable[..., Algorithm]
-
-    def candidates(self, steps: int) -> dict[str, Algorithm]:
-        """The four algorithms by name, for a training of so many steps."""
-        made = {}
-        for values in product(*self.grid.values()):
-            chosen = dict(zip(self.grid, values, strict=True))
-            name = ", ".join(f"{field.replace('_', ' ')} {value}" for field, value in chosen.items())
-            made[name] = self.make(steps=steps, **chosen)
-        return made
-
-
-REPLAY_GRID: Final = {"learning_rate": (1e-4, 1e-3), "tau": (None, 0.005)}
-ROLLOUT_GRID: Final = {"learning_rate": (3e-4, 1e-3), "entropy_coeff": (0.01, 0.05)}
-
-
-def off_policy(kind: Callable[..., Algorithm]) -> Way:
-    """DQN, VDN or QMIX."""
-    return Way(
-        REPLAY_GRID,
-        lambda *, steps, learning_rate, tau: kind(settings=replay(learning_rate, steps=steps, tau=tau)),
-    )
-
-
-def on_policy(kind: Callable[..., Algorithm]) -> Way:
-    """PPO, IPPO or MAPPO."""
-    return Way(
-        ROLLOUT_GRID,
-        lambda *, steps, learning_rate, entropy_coeff: kind(
-            settings=rollouts(learning_rate), entropy_coeff=entropy_coeff
-        ),
-    )
-
-
-WAYS: Final[dict[str, Way]] = {
-    "DQN": off_policy(DQN),
-    "PPO": on_policy(PPO),
-    "IPPO": on_policy(IPPO),
-    "VDN": off_policy(VDN),
-    "QMIX": off_policy(QMIX),
-    "MAPPO": on_policy(MAPPO),
-    "MADDPG": Way(
-        {"learning_rate": (1e-4, 1e-3), "tau": (0.005, 0.02)},
-        lambda *, steps, learning_rate, tau: MADDPG(settings=replay(learning_rate, steps=steps, tau=tau)),
-    ),
-    "PR2": Way(
-        {"learning_rate": (1e-4, 1e-3), "temperature": (0.02, 0.1)},
-        lambda *, steps, learning_rate, temperature: PR2(
-            settings=replay(learning_rate, steps=steps),
-            temperature=temperature,
-            entropy_bonus=False,  # with it agents are paid for every step that the board lives
-        ),
-    ),
-    "LOLA": Way(
-        {"learning_rate": (1e-3, 1e-2), "look_ahead_rate": (0.01, 0.05)},
-        lambda *, steps, learning_rate, look_ahead_rate: LOLA(
-            settings=LOLASettings(gamma=GAMMA, learning_rate=learning_rate, look_ahead_rate=look_ahead_rate)
-        ),
-    ),
+OFF_POLICY: Final = {"learning_rate": (1e-4, 1e-3), "tau": (None, 0.005)}
+ON_POLICY: Final = {"learning_rate": (3e-4, 1e-3), "entropy_coeff": (0.01, 0.05)}
+WAYS: Final[dict[str, tuple[Any, dict[str, tuple[Any, Any]]]]] = {
+    "DQN": (DQN, OFF_POLICY),
+    "PPO": (PPO, ON_POLICY),
+    "IPPO": (IPPO, ON_POLICY),
+    "VDN": (VDN, OFF_POLICY),
+    "QMIX": (QMIX, OFF_POLICY),
+    "MAPPO": (MAPPO, ON_POLICY),
+    "MADDPG": (MADDPG, {"learning_rate": (1e-4, 1e-3), "tau": (0.005, 0.02)}),
+    "PR2": (PR2, {"learning_rate": (1e-4, 1e-3), "temperature": (0.02, 0.1)}),
+    "LOLA": (LOLA, {"learning_rate": (1e-3, 1e-2), "look_ahead_rate": (0.01, 0.05)}),
 }
+"""The algorithm of each way, and the two values of each of two settings."""
+
+
+def candidates(way: str, steps: int) -> dict[str, Algorithm]:
+    """Return the four algorithms of a way by name, for a training of so many steps."""
+    kind, grid = WAYS[way]
+    algorithms = {}
+    for values in product(*grid.values()):
+        settings = dict(zip(grid, values, strict=True))
+        name = ", ".join(f"{field.replace('_', ' ')} {value}" for field, value in settings.items())
+        algorithms[name] = _algorithm(kind, steps, **settings)
+    return algorithms
+
+
+def _algorithm(kind: Any, steps: int, *, learning_rate: float, **setting: Any) -> Algorithm:
+    """Return an algorithm; exploration in what learns from replay decays over the first half of the
+    training."""
+    common = {"gamma": GAMMA, "learning_rate": learning_rate}
+    if kind is LOLA:
+        return LOLA(settings=LOLASettings(**common, **setting))
+    if "entropy_coeff" in setting:
+        return kind(settings=RolloutSettings(**common), **setting)
+    replay = {**common, "buffer_size": 50_000, "epsilon_decay_steps": steps // 2}
+    if kind is PR2:  # with an entropy bonus agents are paid for every step that the board lives
+        return PR2(settings=DQNSettings(**replay), entropy_bonus=False, **setting)
+    return kind(settings=DQNSettings(**replay, **setting))
 
 
 def agents_of(algorithm: Algorithm, agents: int) -> tuple[AgentSpec, ...]:
-    """All agents of a game learning by an algorithm; teams that need not share a reward do not."""
+    """Return all agents of a game learning by an algorithm; teams that need not share a reward do not."""
     if not isinstance(algorithm, TeamAlgorithm):
         return (Learning(algorithm),) * agents
     reward = "team" if algorithm.shares_reward else "individual"
     return (Team(algorithm, tuple(range(agents)), reward=reward),)
 
 
-def study(board: Board, algorithms: dict[str, Algorithm], **how: Any) -> cprl.Study:
-    """A study with a condition for each algorithm, by the rules of the published study as run.
+def study(
+    board: Board, algorithms: Mapping[str, Algorithm], experiment: Mapping[str, Any], **fields: Any
+) -> cprl.Study:
+    """Return a study with a condition for each algorithm, by the rules of the published study as run.
 
     Args:
-        board: its board.
         algorithms: by the name of the condition.
-        how: the rest of the experiment and of the study.
+        experiment: fields of the experiment.
+        fields: of the study.
     """
     game = presets.game(board, variant="as_run")
-    fields = {"seed", "episodes", "evaluation_episodes"}
-    first, *_ = algorithms.values()
+    agents = {name: agents_of(algorithm, game.agents) for name, algorithm in algorithms.items()}
     base = cprl.Experiment(
-        name=f"learners_{board}",
-        game=game,
-        agents=agents_of(first, game.agents),
-        **{name: how.pop(name) for name in fields & set(how)},
+        name=f"learners_{board}", game=game, agents=next(iter(agents.values())), **experiment
     )
-    conditions = {name: {"agents": agents_of(own, game.agents)} for name, own in algorithms.items()}
-    return cprl.Study(base, conditions=conditions, **how)
+    conditions = {name: {"agents": specs} for name, specs in agents.items()}
+    return cprl.Study(base, conditions=conditions, **fields)
 
 
 def winners(table: StudyTable) -> dict[str, str]:
-    """The candidate of each way that gets most in fresh worlds, from the table of a tuning.
+    """Return the candidate of each way that gets most in fresh worlds, from the table of a tuning.
 
     Candidates that were not trained are not chosen, which is said.
     """
@@ -163,25 +118,30 @@ def winners(table: StudyTable) -> dict[str, str]:
         harvest = harvests.get((condition, "collective_return"))
         if harvest is None:
             say(f"Not evaluated, and not chosen from: {condition}")
-        else:
-            best[way] = max(best.get(way, (float("-inf"), "")), (harvest.value, candidate))
+        elif way not in best or harvest.value > best[way][0]:
+            best[way] = (harvest.value, candidate)
     return {way: candidate for way, (_, candidate) in best.items()}
 
 
+def print_winners(path: Path) -> None:
+    """Print the `winners` of the table of a tuning, if it is there."""
+    if path.exists():
+        for way, candidate in winners(StudyTable.read(path)).items():
+            print(f"{way}: {candidate}")
+
+
 def tuning(board: Board) -> cprl.Study:
-    """Every candidate of every way, on seeds of its own."""
+    """Return the study of every candidate of every way, on seeds that no other study has."""
     steps = 150_000
     return study(
         board,
         {
             f"{way}: {candidate}": algorithm
-            for way, own in WAYS.items()
-            for candidate, algorithm in own.candidates(steps).items()
+            for way in WAYS
+            for candidate, algorithm in candidates(way, steps).items()
         },
-        seed=1000,
+        {"seed": 1000, "episodes": steps // 1000, "evaluation_episodes": 20},
         replicas=2,
-        episodes=steps // 1000,
-        evaluation_episodes=20,
         name=f"learners_tuning_{board}",
         question="Which settings suit which way to learn?",
         expectation=(
@@ -191,25 +151,20 @@ def tuning(board: Board) -> cprl.Study:
     )
 
 
-AS_RUN: Final = "DQN as run"
-
-
 def comparison(board: Board, chosen: Mapping[str, str], episodes: Mapping[str, int]) -> cprl.Study:
-    """The chosen candidate of every way, and the DQN of the published study, whose course is known.
+    """Return the study of the chosen candidate of every way, and of the DQN of the published study, whose
+    course is known.
 
     Args:
-        board: its board.
         chosen: the name of a candidate by way.
         episodes: by way, as many as it takes for a million steps of each replica; "" for all others.
     """
-    algorithms = {way: own.candidates(STEPS)[chosen[way]] for way, own in WAYS.items()}
-    algorithms[AS_RUN] = DQN(settings=presets.dqn_settings(board, variant="as_run"))
-    made = study(
+    algorithms = {way: candidates(way, STEPS)[chosen[way]] for way in WAYS}
+    algorithms["DQN as run"] = DQN(settings=presets.dqn_settings(board, variant="as_run"))
+    short = study(
         board,
         algorithms,
-        seed=0,
-        episodes=episodes[""],
-        evaluation_episodes=50,
+        {"seed": 0, "episodes": episodes[""], "evaluation_episodes": 50},
         replicas=5,
         reference="DQN",
         name=f"learners_{board}",
@@ -221,6 +176,7 @@ def comparison(board: Board, chosen: Mapping[str, str], episodes: Mapping[str, i
         ),
     )
     longer = {
-        way: {**own, "episodes": episodes.get(way, episodes[""])} for way, own in made.conditions.items()
+        way: {**changes, "episodes": episodes.get(way, episodes[""])}
+        for way, changes in short.conditions.items()
     }
-    return replace(made, conditions=longer)
+    return replace(short, conditions=longer)

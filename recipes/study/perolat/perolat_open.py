@@ -1,4 +1,4 @@
-"""The tragedy on the open map, and what the beam does to it: lengths of 10 and 20 cells, and no beam.
+"""What does the beam do to the tragedy on the open map? Lengths of 10 and 20 cells, and no beam.
 
     python recipes/study/perolat/perolat_open.py --jobs 2 --runs studies/runs
 

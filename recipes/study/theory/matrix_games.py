@@ -8,7 +8,8 @@ Sources: Foerster et al. (2018), "Learning with Opponent-Learning Awareness", AA
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
-from typing import Any, Final, NamedTuple, TypedDict, Unpack
+from string import ascii_uppercase
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import torch
@@ -34,7 +35,7 @@ class MatrixGame(StageGame):
     """
 
     payoffs: Any
-    """What all N agents are paid, float [A, ..., A, N]: an axis for the action of each agent, and their
+    """The payments of all N agents, float [A, ..., A, N]: an axis for the action of each agent, and their
     payoffs last; nested tuples, lists or an array."""
 
     def __post_init__(self) -> None:
@@ -43,27 +44,28 @@ class MatrixGame(StageGame):
 
     @property
     def agents(self) -> int:
-        """The number of agents N."""
+        """Return the number of agents N."""
         return np.ndim(self.payoffs) - 1
 
     @property
     def actions(self) -> int:
-        """The number of actions A of each agent."""
+        """Return the number of actions A of each agent."""
         return len(self.payoffs)
 
     @property
     def joint_actions(self) -> tuple[str, ...]:
-        """The joint actions of a small game in letters, that of agent 0 first: C and D in a social dilemma of
-        two, where both are paid more if both choose action 0, else A and so on. None of a large game."""
+        """Return the joint actions of a small game in letters, that of agent 0 first: C and D in a social
+        dilemma of two, where both are paid more if both choose action 0, else A and so on. None of a large
+        game."""
         if self.actions**self.agents > _MOST_NAMED:
             return ()
-        letters = "CD" if self._is_dilemma else "ABCDEFGHIJKLMNOP"[: self.actions]
+        letters = "CD" if self._is_dilemma else ascii_uppercase[: self.actions]
         return tuple(map("".join, product(letters, repeat=self.agents)))
 
     @property
     def _is_dilemma(self) -> bool:
-        """Whether two agents with the same payoffs are paid more if both choose action 0, and one is tempted
-        by action 1 or fears the other's."""
+        """Return whether two agents with the same payoffs are paid more if both choose action 0, and one is
+        tempted by action 1 or fears the other's."""
         payoffs = np.array(self.payoffs)
         if payoffs.shape != (2, 2, 2) or not (payoffs[..., 0] == payoffs[..., 1].T).all():
             return False
@@ -72,7 +74,8 @@ class MatrixGame(StageGame):
         return bool(is_better and (temptation > reward or punishment > sucker))
 
     def tables(self, device: torch.device) -> "_Tables":
-        joint, agents = self.actions**self.agents, torch.arange(self.agents)
+        joint = self.actions**self.agents
+        agents = torch.arange(self.agents)
         after = (agents - agents[:, None]) % self.agents
         payoffs = torch.tensor(self.payoffs, dtype=torch.float32, device=device)
         return _Tables(
@@ -94,13 +97,13 @@ class _Tables(NamedTuple):
     blank: Tensor
     """A**N, the number of a joint action before the first."""
     payoffs: Tensor
-    """What agents are paid, [A**N, N], by the number of the joint action as agent 0 sees it."""
+    """The payments of agents, [A**N, N], by the number of the joint action as agent 0 sees it."""
     places: Tensor
-    """By which each agent's action (column) counts in the number that an agent (row) sees, [N, N]."""
+    """The weight of each agent's action (column) in the number that an agent (row) sees, [N, N]."""
 
 
 def _table(payoffs: Any) -> tuple[Any, ...]:
-    """Payoffs as nested tuples of Python's floats."""
+    """Return payoffs as nested tuples of Python's floats."""
     name = "MatrixGame.payoffs"
     try:
         table = np.asarray(payoffs, np.float64)
@@ -123,23 +126,15 @@ def _nested_tuples(value: Any) -> Any:
     return tuple(map(_nested_tuples, value)) if isinstance(value, list) else value
 
 
-class Clock(TypedDict, total=False):
-    """How long a matrix game lasts and what agents remember of it, see `MatrixGame`."""
-
-    turns: int
-    memory: int | None
-    continue_prob: float
-
-
 def prisoners_dilemma(
     *,
     reward: float = -1.0,
     sucker: float = -3.0,
     temptation: float = 0.0,
     punishment: float = -2.0,
-    **clock: Unpack[Clock],
+    **clock: Any,
 ) -> MatrixGame:
-    """The prisoner's dilemma; action 0 cooperates, 1 defects.
+    """Return the prisoner's dilemma; action 0 cooperates, 1 defects.
 
     By default the payoffs of Foerster et al. (2018), table 1. Leibo et al. (2017), figure 1, have 3, 0, 4, 1.
     Refuses others than temptation > reward > punishment > sucker.
@@ -149,6 +144,7 @@ def prisoners_dilemma(
         sucker: of who cooperates alone.
         temptation: of who defects alone.
         punishment: of both where both defect.
+        clock: turns, memory and continue_prob of a `StageGame`.
     """
     return _symmetric(
         ("temptation > reward > punishment > sucker",), clock, reward, sucker, temptation, punishment
@@ -161,9 +157,9 @@ def stag_hunt(
     sucker: float = 0.0,
     temptation: float = 3.0,
     punishment: float = 1.0,
-    **clock: Unpack[Clock],
+    **clock: Any,
 ) -> MatrixGame:
-    """The stag hunt; action 0 hunts the stag, 1 the hare. Payoffs of Leibo et al. (2017), figure 1.
+    """Return the stag hunt; action 0 hunts the stag, 1 the hare. Payoffs of Leibo et al. (2017), figure 1.
 
     Arguments are those of `prisoners_dilemma`, where to cooperate is to hunt the stag. Refuses others than
     reward > temptation > sucker and reward > punishment > sucker.
@@ -178,9 +174,9 @@ def chicken(
     sucker: float = 1.0,
     temptation: float = 4.0,
     punishment: float = 0.0,
-    **clock: Unpack[Clock],
+    **clock: Any,
 ) -> MatrixGame:
-    """Chicken; action 0 swerves, 1 goes straight on. Payoffs of Leibo et al. (2017), figure 1.
+    """Return chicken; action 0 swerves, 1 goes straight on. Payoffs of Leibo et al. (2017), figure 1.
 
     Arguments are those of `prisoners_dilemma`, where to cooperate is to swerve. Refuses others than
     temptation > reward > sucker > punishment.
@@ -190,26 +186,32 @@ def chicken(
     )
 
 
-def matching_pennies(*, stake: float = 1.0, **clock: Unpack[Clock]) -> MatrixGame:
-    """Matching pennies; agent 0 wins where both show the same side, agent 1 where they do not.
+def matching_pennies(*, stake: float = 1.0, **clock: Any) -> MatrixGame:
+    """Return matching pennies; agent 0 wins where both show the same side, agent 1 where they do not.
 
     Payoffs of Foerster et al. (2018), table 2; the winner gets `stake`, above 0, and the other loses it.
     """
     if not stake > 0:
         raise refusal("stake", stake, "a number above 0")
-    same, other = (stake, -stake), (-stake, stake)
-    return MatrixGame(((same, other), (other, same)), **clock)
+    same = (stake, -stake)
+    return MatrixGame(((same, same[::-1]), (same[::-1], same)), **clock)
 
 
 def _symmetric(
-    orders: Sequence[str], clock: Clock, reward: float, sucker: float, temptation: float, punishment: float
+    orders: Sequence[str],
+    clock: dict[str, Any],
+    reward: float,
+    sucker: float,
+    temptation: float,
+    punishment: float,
 ) -> MatrixGame:
-    """The game of these payoffs; raises a ValueError unless they are in these orders."""
+    """Return the game of these payoffs; raise a ValueError unless they are in these orders."""
     payoffs = {"reward": reward, "sucker": sucker, "temptation": temptation, "punishment": punishment}
     for order in orders:
         names = order.split(" > ")
         if not all(payoffs[one] > payoffs[other] for one, other in pairwise(names)):
-            came = ", ".join(f"{name} {payoffs[name]:g}" for name in names)
-            raise ValueError(f"the payoffs are {came}; allowed: {order}")
-    cooperates, defects = ((reward, reward), (sucker, temptation)), ((temptation, sucker), (punishment,) * 2)
+            numbers = ", ".join(f"{name} {payoffs[name]:g}" for name in names)
+            raise ValueError(f"the payoffs are {numbers}; allowed: {order}")
+    cooperates = ((reward, reward), (sucker, temptation))
+    defects = ((temptation, sucker), (punishment, punishment))
     return MatrixGame((cooperates, defects), **clock)

@@ -13,6 +13,7 @@ All take about half an hour of a core.
 
 from collections.abc import Iterator
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 from typing import Final
 
@@ -20,8 +21,8 @@ import pyarrow as pa
 import tyro
 
 from cprl import Fresh, Game, presets
-from cprl.commands.recipe import in_a_sentence
-from cprl.evaluation import dilemma, draw_schelling, margins, payoffs_of, schelling
+from cprl.commands.recipe_command import exit_with_message
+from cprl.experimental.schelling import dilemma, draw_schelling, margins, payoffs_of, schelling
 from cprl.institutions import GraduatedSanctions, Quota, Tax
 from cprl.measuring.statistics import estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
@@ -48,21 +49,22 @@ GREEDY: Final = ("greedy", "territorial")
 
 
 def game_of(board: str, rules: str) -> Game:
-    """A board under rules, by their names."""
+    """Return a board under rules, by their names."""
     game = presets.game(board, variant="as_run")
     return replace(game, rules=replace(game.rules, **RULES[rules]), institutions=INSTITUTIONS.get(rules, ()))
 
 
 def row_of(board: str, rules: str, greedy: str, table: pa.Table) -> list[str]:
-    """A line of the table."""
+    """Return a line of the table."""
     payoffs = payoffs_of(table)
-    ends = [of_kind[:, at] for at in (-1, 0) for of_kind in (payoffs.restrained, payoffs.greedy)]
-    found = margins(payoffs.restrained, payoffs.greedy)
+    ends = [payoff[:, at] for at in (-1, 0) for payoff in (payoffs.cooperators, payoffs.defectors)]
+    differences = margins(payoffs.cooperators, payoffs.defectors)
+    agents = greedy if greedy in SCRIPTED_POLICIES else "trained DQN"
     return [
-        *(f"`{board}`", rules, greedy if greedy in SCRIPTED_POLICIES else "trained DQN"),
+        *(f"`{board}`", rules, agents),
         *(f"{estimate(values):.4g}" for values in ends),
-        *(f"{found[name]:.4g}" for name in ("restraint", "fear", "greed")),
-        dilemma(found),
+        *(f"{differences[name]:.4g}" for name in ("restraint", "fear", "greed")),
+        dilemma(differences),
     ]
 
 
@@ -82,17 +84,17 @@ HEADINGS: Final = (
 
 
 def diagrams(trained: Path) -> Iterator[tuple[str, str, str]]:
-    """Board, rules and who plays greedy of each diagram; says where there is no run of trained agents."""
-    for board in BOARDS:
-        for rules in RULES:
-            greedy = [*GREEDY[: 1 if rules == "no beam" else None]]
-            yield from ((board, rules, who) for who in greedy)
-            if rules == "as run":
-                run = trained / board
-                if (run / RECIPE_FILE).exists():
-                    yield board, rules, str(run)
-                else:
-                    say(f"{run} holds no run; the diagram of {board} with trained agents is left out")
+    """Yield board, rules and greedy agents of each diagram; say where there is no run of trained agents."""
+    for board, rules in product(BOARDS, RULES):
+        for policy in GREEDY:
+            if rules != "no beam" or policy == GREEDY[0]:
+                yield board, rules, policy
+        if rules == "as run":
+            run = trained / board
+            if (run / RECIPE_FILE).exists():
+                yield board, rules, str(run)
+            else:
+                say(f"{run} holds no run; the diagram of {board} with trained agents is left out")
 
 
 def main(
@@ -102,7 +104,7 @@ def main(
     episodes: int = 5,
     replicas: tuple[int, ...] = (),
 ) -> None:
-    """Measures all diagrams; restrained agents are the scripted "sustainable".
+    """Measure all diagrams; restrained agents are the scripted "sustainable".
 
     Args:
         out: where to: table.md and a figure for each diagram.
@@ -111,23 +113,23 @@ def main(
         episodes: of each replica and choice of restrained agents.
         replicas: which ones, by number; by default all of trained agents, and 0 to 7 of scripted ones.
     """
-    asked = []
-    for board, rules, who in diagrams(trained):
-        name = f"{board}_{rules}_{who if who in SCRIPTED_POLICIES else 'trained'}"
-        figure = check_picture(out / f"{name.replace(',', '').replace(' ', '_')}.png")
-        asked.append((board, rules, who, figure))
+    figures = {}
+    for board, rules, greedy in diagrams(trained):
+        agents = greedy if greedy in SCRIPTED_POLICIES else "trained"
+        name = f"{board}_{rules}_{agents}".replace(",", "").replace(" ", "_")
+        figures[board, rules, greedy] = check_picture(out / f"{name}.png")
     out.mkdir(parents=True, exist_ok=True)
     rows = []
-    for board, rules, who, figure in asked:
+    for (board, rules, greedy), figure in figures.items():
         fresh = Fresh(episodes=episodes, replicas=replicas)
-        table = schelling(game_of(board, rules), fresh, greedy=who)
+        table = schelling(game_of(board, rules), fresh, greedy=greedy)
         draw_schelling(table, figure)
-        rows.append(row_of(board, rules, who, table))
+        rows.append(row_of(board, rules, greedy, table))
         say("; ".join(rows[-1]))
     lines = [f"| {' | '.join(cells)} |" for cells in (HEADINGS, ["---"] * len(HEADINGS), *rows)]
     (out / "table.md").write_text("\n".join([*lines, ""]), encoding="utf-8")
 
 
 if __name__ == "__main__":
-    with in_a_sentence("schelling.py"):
+    with exit_with_message("schelling.py"):
         tyro.cli(main)

@@ -1,4 +1,4 @@
-"""The herders' game and appropriation, repeated: do independent learners end at the equilibrium?
+"""Do independent learners end at the equilibrium? The herders' game and appropriation, repeated.
 
     python recipes/study/theory/sharing.py --kind appropriation --learner tables --watch off
 
@@ -24,12 +24,12 @@ EPISODES = 150
 
 
 def sharing_of(kind: Kind, herd: int) -> SharingGame:
-    """The game of so many agents."""
+    """Return the game of so many agents."""
     return herders(herd) if kind == "herders" else appropriation(herd)
 
 
 def algorithm_of(learner: Learner, gamma: float) -> Algorithm:
-    """How an agent learns; exploration ends after 5,000 of 7,500 turns."""
+    """Return how an agent learns; exploration ends after 5,000 of 7,500 turns."""
     if learner == "tables":
         return Tabular(
             settings=TabularSettings(
@@ -53,7 +53,7 @@ def experiment(
     memory: int = 0,
     gamma: float = 0.0,
 ) -> cprl.Experiment:
-    """Independent learners who choose, turn after turn, how much they take of what they share.
+    """Return independent learners who choose, turn after turn, how much they take of what they share.
 
     Args:
         kind: herders on a pasture, or appropriation as in the laboratory.

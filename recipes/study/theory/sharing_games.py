@@ -20,14 +20,14 @@ from cprl.values import Positive, Range, Value, Where, checked
 T = TypeVar("T")
 
 _STEP: Final = 1e-6
-"""Of the numerical slope, as a share of the range."""
+"""The step of the numerical derivative, as a share of the range."""
 _TRIED: Final = 64
 """Totals at which a function of the user's own is tried."""
 _ROUNDING: Final = 1e-9
 _NOTHING: Final = 1e-3
-"""What a unit may still be worth at `most`, as a share of the highest value."""
+"""The worth that a unit may still have at `most`, as a share of the highest value."""
 _PRECISION: Final = 1e-14
-"""Of a root."""
+"""The precision of a root."""
 _MOST: Final = 1e12
 Above0 = Annotated[float, Where(lambda value: 0 < value <= _MOST, f"a number above 0, up to {_MOST:g}")]
 Cost = Annotated[float, Range(0, _MOST)]
@@ -40,13 +40,13 @@ class Worth(Protocol):
 
     @property
     def most(self) -> float:
-        """The total from which on a unit is worth nothing."""
+        """Return the total from which on a unit is worth nothing."""
 
     def at(self, total: float) -> float:
-        """v(A)."""
+        """Return v(A)."""
 
-    def slope(self, total: float) -> float:
-        """v'(A), below `most`."""
+    def derivative(self, total: float) -> float:
+        """Return v'(A), below `most`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class PowerWorth(Value):
     top: Above0 = 10.0
     """v(0)."""
     factor: Above0 = 1.0
-    """How steeply it falls."""
+    """The steepness of its fall."""
     power: Annotated[float, Range(1, 64)] = 2.0
     """With 1 it is a straight line."""
 
@@ -67,11 +67,12 @@ class PowerWorth(Value):
     def at(self, total: float) -> float:
         return float(max(self.top - self.factor * total**self.power, 0.0))
 
-    def slope(self, total: float) -> float:
+    def derivative(self, total: float) -> float:
         return float(-self.factor * self.power * total ** (self.power - 1))
 
     def balance(self, cost: float, share: float) -> float:
-        """The total A with v(A) + share A v'(A) = cost, in closed form; 0 where v(0) is below the cost."""
+        """Return the total A with v(A) + share A v'(A) = cost, in closed form; 0 where v(0) is below the
+        cost."""
         return float(
             (max(self.top - cost, 0.0) / (self.factor * (1 + share * self.power))) ** (1 / self.power)
         )
@@ -103,9 +104,10 @@ class CallableWorth(Value):
     def at(self, total: float) -> float:
         return float(self.function(total)) if total < self.most else 0.0
 
-    def slope(self, total: float) -> float:
+    def derivative(self, total: float) -> float:
         step = _STEP * self.most
-        low, high = max(total - step, 0.0), min(total + step, self.most)
+        low = max(total - step, 0.0)
+        high = min(total + step, self.most)
         return (float(self.function(high)) - float(self.function(low))) / (high - low)
 
 
@@ -129,7 +131,7 @@ class SharingGame(Value):
 
     def __post_init__(self) -> None:
         if isinstance(self.worth, Mapping):
-            object.__setattr__(self, "worth", of_table(PowerWorth, self.worth, "SharingGame.worth"))
+            object.__setattr__(self, "worth", from_table(PowerWorth, self.worth, "SharingGame.worth"))
         super().__post_init__()
 
     def to_config(self) -> dict[str, Any]:
@@ -140,7 +142,7 @@ class SharingGame(Value):
         return {**arguments, "worth": self.worth.to_config()}
 
     def payoffs(self, taken: ArrayLike) -> NDArray[np.float64]:
-        """What agents are paid, float64 [..., n].
+        """Return what agents are paid, float64 [..., n].
 
         Args:
             taken: what each takes, float [..., n], from 0 to `most_each`.
@@ -157,46 +159,49 @@ class SharingGame(Value):
         return paid
 
     def surplus(self, total: float) -> float:
-        """What all agents together gain when they take so much in all: X (v(X) - c), without payments."""
+        """Return what all agents together gain when they take so much in all: X (v(X) - c), without
+        payments."""
         return total * (self.worth.at(total) - self.cost)
 
     @cached_property
     def nash_total(self) -> float:
-        """X* of the symmetric Nash equilibrium, in which each agent takes X* / n."""
+        """Return X* of the symmetric Nash equilibrium, in which each agent takes X* / n."""
         return self._balance(1 / self.agents)
 
     @cached_property
     def optimum_total(self) -> float:
-        """X** that is best for the group."""
+        """Return X** that is best for the group."""
         return self._balance(1.0)
 
     @cached_property
     def open_access_total(self) -> float:
-        """The total at which a unit is worth what it costs, and nobody gains anything."""
+        """Return the total at which a unit is worth what it costs, and nobody gains anything."""
         return self._balance(0.0)
 
     @property
     def price_of_anarchy(self) -> float:
-        """The surplus at the optimum over that in equilibrium, at least 1; 1 where nothing can be gained."""
-        best, reached = self.surplus(self.optimum_total), self.surplus(self.nash_total)
+        """Return the surplus at the optimum over that in equilibrium, at least 1; 1 where nothing can be
+        gained."""
+        best = self.surplus(self.optimum_total)
+        reached = self.surplus(self.nash_total)
         if best <= 0:
             return 1.0
         return best / reached if reached > 0 else inf
 
     @property
     def rent_share(self) -> float:
-        """The surplus in equilibrium as a share of that at the optimum, the inverse of `price_of_anarchy`."""
+        """Return the surplus in equilibrium as a share of that at the optimum: 1 / `price_of_anarchy`."""
         return 1 / self.price_of_anarchy
 
     def best_response(self, others: float) -> float:
-        """What an agent takes to gain most while all others together take so much.
+        """Return what an agent takes to gain most while all others together take so much.
 
         It solves v(x + O) + x v'(x + O) = c, where O is what the others take.
         """
         worth = self.worth
 
         def gain(taken: float) -> float:
-            return worth.at(taken + others) + taken * worth.slope(taken + others) - self.cost
+            return worth.at(taken + others) + taken * worth.derivative(taken + others) - self.cost
 
         return _root(gain, min(self._limit, max(worth.most - others, 0.0)))
 
@@ -205,19 +210,20 @@ class SharingGame(Value):
         return inf if self.most_each is None else self.most_each
 
     def _balance(self, share: float) -> float:
-        """The total X with v(X) + share X v'(X) = c, or the nearest one that agents can take."""
-        worth, most = self.worth, self.agents * self._limit
+        """Return the total X with v(X) + share X v'(X) = c, or the nearest one that agents can take."""
+        worth = self.worth
+        most = self.agents * self._limit
         if isinstance(worth, PowerWorth):
             return min(worth.balance(self.cost, share), most)
 
         def gain(total: float) -> float:
-            return worth.at(total) + share * total * worth.slope(total) - self.cost
+            return worth.at(total) + share * total * worth.derivative(total) - self.cost
 
         return _root(gain, min(worth.most, most))
 
 
-def herders(agents: int, *, worth: Worth | None = None, cost: float = 1.0) -> SharingGame:
-    """n herders graze a_i animals each on a common pasture; an animal is worth v(A) when A graze in all.
+def herders(agents: int, *, worth: Worth = PowerWorth(), cost: float = 1.0) -> SharingGame:
+    """Return the game of n herders who graze a_i animals each; one is worth v(A) when A graze in all.
 
     With v(A) = 10 - A^2 and c = 1 the optimum is A** = 1.7321, and A* = 1.7321, 2.1213, 2.5355, 2.7386 and
     2.9704 for 1, 2, 5, 10 and 100 herders.
@@ -229,7 +235,7 @@ def herders(agents: int, *, worth: Worth | None = None, cost: float = 1.0) -> Sh
         worth: v; by default 10 - A^2.
         cost: c, of an animal.
     """
-    return SharingGame(agents=agents, worth=PowerWorth() if worth is None else worth, cost=cost)
+    return SharingGame(agents=agents, worth=worth, cost=cost)
 
 
 def appropriation(
@@ -240,7 +246,7 @@ def appropriation(
     linear: float = 23.0,
     quadratic: float = 0.25,
 ) -> SharingGame:
-    """Agents divide their tokens between a common-pool resource and an outside activity.
+    """Return the game of agents who divide tokens between a common-pool resource and an outside activity.
 
     The resource pays F(X) = linear X - quadratic X^2 for all X tokens in it, to each agent the share that its
     tokens have; a token outside pays `outside`. With the numbers of the experiments 8 agents put in 8 tokens
@@ -254,11 +260,12 @@ def appropriation(
         outside: w, what a token earns outside.
     """
     worth = PowerWorth(top=linear, factor=quadratic, power=1.0)
-    tokens, outside = checked("tokens", tokens, Above0), checked("outside", outside, Cost)
+    tokens = checked("tokens", tokens, Above0)
+    outside = checked("outside", outside, Cost)
     return SharingGame(agents=agents, worth=worth, cost=outside, most_each=tokens, payment=tokens * outside)
 
 
-def of_table(kind: type[T], table: Mapping[str, Any], name: str) -> T:
+def from_table(kind: type[T], table: Mapping[str, Any], name: str) -> T:
     """Return a value of the table of its fields; raise a ValueError with its name for other fields."""
     try:
         return kind(**table)
@@ -267,7 +274,7 @@ def of_table(kind: type[T], table: Mapping[str, Any], name: str) -> T:
 
 
 def _root(falling: Callable[[float], float], most: float) -> float:
-    """Where a falling function is 0, between 0 and `most`; one of these where it has one sign."""
+    """Return where a falling function is 0, between 0 and `most`; one of these where it has one sign."""
     if most <= 0 or falling(0.0) <= 0:
         return 0.0
     high = float(np.nextafter(most, 0.0))  # a worth may have a kink where it becomes 0

@@ -6,14 +6,14 @@ from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 import torch
-from sharing_games import Above0, SharingGame, of_table
+from sharing_games import Above0, SharingGame, from_table
 from stage_games import StageGame
 from torch import Tensor
 
 from cprl.values import Range
 
 _MOST_TOTALS: Final = 2**22
-"""How many totals there may be when agents choose from levels."""
+"""The totals that there may be when agents choose from levels."""
 OBSERVED: Final = ("played", "own", "total")
 """The numbers by which an agent observes a turn: 1 if there was such a turn, the share that it took of the
 most that it can take, and the share that all took of the most that all can take."""
@@ -33,17 +33,17 @@ class TakingGame(StageGame):
     """
 
     sharing: SharingGame
-    """What agents are paid, and how many they are; e.g. `herders(5)`."""
+    """The payments and the number of agents; e.g. `herders(5)`."""
     _: KW_ONLY
     levels: Annotated[int, Range(2, 2**16)] = 21
-    """From how many evenly spaced amounts an agent chooses, 0 the first."""
+    """The number of evenly spaced amounts from which an agent chooses, 0 the first."""
     most: Above0 | None = None
     """The most that an agent can take in a turn. By default twice what it takes in the symmetric equilibrium,
     or what the game itself allows, `SharingGame.most_each`, if that is less."""
 
     def __post_init__(self) -> None:
         if isinstance(self.sharing, Mapping):
-            object.__setattr__(self, "sharing", of_table(SharingGame, self.sharing, "TakingGame.sharing"))
+            object.__setattr__(self, "sharing", from_table(SharingGame, self.sharing, "TakingGame.sharing"))
         super().__post_init__()
         limit = self.sharing.most_each
         if self.most is None and self.sharing.nash_total <= 0:
@@ -65,17 +65,17 @@ class TakingGame(StageGame):
 
     @property
     def agents(self) -> int:
-        """The number of agents N."""
+        """Return the number of agents N."""
         return self.sharing.agents
 
     @property
     def actions(self) -> int:
-        """The number of actions: `levels`."""
+        """Return the number of actions: `levels`."""
         return self.levels
 
     @property
     def most_each(self) -> float:
-        """The most that an agent can take: `most`, or what its default means."""
+        """Return the most that an agent can take: `most`, or what its default means."""
         if self.most is not None:
             return self.most
         twice = 2 * self.sharing.nash_total / self.agents
@@ -83,7 +83,7 @@ class TakingGame(StageGame):
 
     @property
     def amounts(self) -> tuple[float, ...]:
-        """What an agent takes by its action 0, 1 and so on."""
+        """Return what an agent takes by its action 0, 1 and so on."""
         return tuple(np.linspace(0, self.most_each, self.levels).tolist())
 
     def tables(self, device: torch.device) -> "_Tables":
@@ -97,11 +97,12 @@ class TakingGame(StageGame):
         )
 
     def pay(self, tables: "_Tables", action: Tensor) -> tuple[Tensor, Tensor]:
-        total, most = action.sum(-1, keepdim=True), self.levels - 1
-        paid = tables.amounts[action] * tables.gains[total] + self.sharing.payment
-        share, of_all = action / most, total / (most * self.agents)
-        turn = torch.stack((torch.ones_like(share), share, of_all.expand_as(share)), -1).float()
-        return paid.float(), turn.clamp(0, 1)
+        total = action.sum(-1, keepdim=True)
+        reward = tables.amounts[action] * tables.gains[total] + self.sharing.payment
+        share = action / (self.levels - 1)
+        total_share = total / ((self.levels - 1) * self.agents)
+        turn = torch.stack((torch.ones_like(share), share, total_share.expand_as(share)), -1).float()
+        return reward.float(), turn.clamp(0, 1)
 
     def observe(self, tables: "_Tables", memory: Tensor) -> Tensor:
         return memory.flatten(2).clone()
@@ -111,6 +112,6 @@ class _Tables(NamedTuple):
     blank: Tensor
     """Zeros, the numbers of `OBSERVED` of a turn before the first."""
     amounts: Tensor
-    """What an agent takes by each action, float64: rewards are computed in double precision."""
+    """The amount that an agent takes by each action, float64: rewards are computed in double precision."""
     gains: Tensor
-    """What a unit is worth beyond its cost, by the sum of all levels."""
+    """The worth of a unit beyond its cost, by the sum of all levels."""

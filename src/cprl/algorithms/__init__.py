@@ -1,11 +1,11 @@
-"""Learning algorithms: frozen dataclasses, each with TorchRL's loss over its networks.
+"""Learning algorithms: frozen dataclasses of hyperparameters, which make the networks and the loss of agents.
 
 Modules, in the order in which one reads them:
-    base            Algorithm, OffPolicy, OnPolicy, TeamAlgorithm: the base classes, also for your own
-    dqn, sac, pr2   learn from replay
-    ppo, a2c, reinforce        learn from rollouts
-    vdn, qmix, mappo, ippo, maddpg, lola   teams
-    tabular         Q-learning in tables
+    base                 the base classes, from which you can also derive an algorithm of your own
+    dqn, sac, pr2        algorithms of independent agents that learn from replay
+    ppo, a2c, reinforce  algorithms of independent agents that learn from rollouts
+    vdn, qmix, mappo, ippo, maddpg, lola  algorithms of teams
+    tabular              Q-learning in tables
 """
 
 from cprl.algorithms.a2c import A2C

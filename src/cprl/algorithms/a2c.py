@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from torchrl.objectives import A2CLoss, LossModule
 
-from cprl.algorithms.base import OnPolicy, Weight, actor_critic_loss
+from cprl.algorithms.base import Coefficient, OnPolicy, actor_critic_loss
 from cprl.networks.agent import AgentNetworks
 
 
@@ -15,8 +15,8 @@ class A2C(OnPolicy):
     Source: Mnih et al., "Asynchronous Methods for Deep Reinforcement Learning" (2016), here synchronous.
     """
 
-    entropy_coeff: Weight = 0.01
-    critic_coeff: Weight = 0.5
+    entropy_coeff: Coefficient = 0.01
+    critic_coeff: Coefficient = 0.5
     can_be_recurrent = True
     update = "stacked"
 

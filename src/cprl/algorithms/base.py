@@ -1,7 +1,8 @@
-"""The base classes of algorithms: frozen dataclasses that make the networks, loss and learner of agents.
+"""The base classes of algorithms, and how to write your own.
 
-To write an algorithm, subclass `OffPolicy` or `OnPolicy` as a frozen dataclass with a field `settings`, and
-define `make_network` and `make_loss`; docs/algorithms.md has an example.
+An algorithm is a frozen dataclass that makes the networks, the loss and the learner of agents. To write one,
+subclass `OffPolicy` or `OnPolicy` as a frozen dataclass with a field `settings`, and define `make_network`
+and `make_loss`; docs/algorithms.md has an example.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,66 +16,67 @@ from torchrl.modules import ProbabilisticActor, QValueActor
 from torchrl.objectives import LossModule, ValueEstimators
 
 from cprl.commons.spaces import Spaces
-from cprl.learners.base import AnyLearner
 from cprl.learners.choose_update import choose_update
 from cprl.learners.lanes import Lanes
-from cprl.learners.learner import Learner, Memory
-from cprl.learners.learner import TrainingEngine as TrainingEngine
+from cprl.learners.learner import Learner, Memory, TrainingEngine as TrainingEngine
 from cprl.learners.networks import COMPILED_STEPS, LaneNetworks, Update
 from cprl.learners.optimizers import UpdateRule
 from cprl.learners.plain import PlainNetworks, PlainReplay, PlainRollouts
-from cprl.learners.refusals import check_loss, refuse_other_parts
+from cprl.learners.protocol import AnyLearner
+from cprl.learners.refusals import check_loss, refuse_other_networks
 from cprl.learners.replay import Replay
 from cprl.learners.rollouts import Rollouts
 from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, RolloutSettings
 from cprl.learners.transitions import Horizon
-from cprl.networks.agent import AgentNetworks, acting_part
+from cprl.networks.agent import AgentNetworks, acting_network
 from cprl.networks.mlp import MLP
 from cprl.networks.recurrent import Recurrent, state_cells_of, state_shape_of
 from cprl.networks.specification import Network, new_network
-from cprl.networks.team import Team
+from cprl.networks.team import TeamNetwork
 from cprl.objectives.rewards import Reward, reward_name
 from cprl.objectives.td import TORCHRL_DISTANCES
-from cprl.system.compat import LaneCategorical
+from cprl.system.compat.torchrl import LaneCategorical
 from cprl.values import Custom, Range, Value, Where, checked, hints_of, refusal
 
-Weight = Annotated[float, Range(0, 1e6)]
-"""Of a term of a loss."""
+Coefficient = Annotated[float, Range(0, 1e6)]
+"""The weight of one term of a loss, 0 or more."""
 
 
 class Algorithm(Value, stored=False):
-    """How an agent learns: hyperparameters, networks, loss and learner.
+    """The base of algorithms: it makes the networks, memory, loss and learner of agents.
 
-    Agents with equal algorithms learn as lanes of one stacked update, so an algorithm must be a frozen
-    dataclass.
+    Agents with equal algorithms learn as lanes of one update. So an algorithm must be a frozen dataclass,
+    whose values can be compared.
     """
 
     settings: Any
-    """The hyperparameters."""
+    """The hyperparameters, a `settings_kind`."""
     network: Any
-    """The architecture of its networks; None for fully connected layers of `settings.hidden_cells`."""
+    """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     settings_kind: ClassVar[type[Any]] = object
-    """The class of the settings."""
+    """The class of `settings`."""
     stochastic: ClassVar[bool] = False
-    """Whether the acting network outputs the logits of a policy, from which actions are sampled; else it
+    """True if the acting network outputs the logits of a policy, from which actions are sampled; else it
     outputs action values, and actions are epsilon-greedy."""
     loss_functions: ClassVar[tuple[str, ...]] = TORCHRL_DISTANCES
-    """What its field `loss_function` may be, if it has one."""
+    """The values that the field `loss_function` may have, in algorithms that have this field."""
     shares_reward: ClassVar[bool] = False
-    """Whether the members of a team must get the team reward; else each has its own."""
+    """True if the members of a team must learn from the team reward; else each can have its own."""
     can_share_parameters: ClassVar[bool] = False
-    """Whether agents of a team can share one network."""
+    """True if the members of a team can share one network."""
     can_be_recurrent: ClassVar[bool] = False
-    """Whether its networks can be recurrent: its loss must pass on the states of sequences, see
+    """True if the networks can be recurrent. Then the loss must pass on the states of sequences, see
     `cprl.algorithms.base.module_of`."""
 
     update: ClassVar[Update | None] = None
-    """How its lanes are updated. A class says it of its own loss and networks, see `said_update`; where none
-    is said, "vmapped" is taken if that works, else "list", see `choose_update`."""
+    """How the lanes are updated, see `cprl.learners.networks.Update`. A class declares it for its own loss
+    and networks, see `declared_update`. Without a declaration "vmapped" is taken if torch can vmap the loss,
+    else "list", see `choose_update`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        name, functions = type(self).__name__, self.loss_functions
+        name = type(self).__name__
+        functions = self.loss_functions
         checked(f"{name}.settings", self.settings, self.settings_kind)
         if hasattr(self, "loss_function"):
             allowed = Where(lambda function: function in functions, ", ".join(map(repr, functions)))
@@ -89,7 +91,8 @@ class Algorithm(Value, stored=False):
             )
 
     def _refuse_unread(self, loss: Custom | None) -> None:
-        """Refuse what a loss of the user's own does not read, of an algorithm that has one."""
+        """Raise a ValueError if the user gives a loss, and also changes a field that only the default loss
+        reads."""
         if loss is None:
             return
         for name in hints_of(type(self)):
@@ -100,9 +103,17 @@ class Algorithm(Value, stored=False):
                 raise refusal(f"{type(self).__name__}.{name}", value, allowed)
 
     def new_network(self, spaces: Spaces, outputs: int, **options: Any) -> nn.Module:
-        """Return a new network of the algorithm's architecture; `options` are those of
-        `cprl.networks.specification.new_network`."""
-        network, cells = self.network, self.settings.hidden_cells
+        """Return a new network of the algorithm's architecture.
+
+        Args:
+            outputs: the number of outputs.
+            options: further arguments of `cprl.networks.specification.new_network`.
+
+        Raises:
+            ValueError: if both the network and the settings say the hidden layers.
+        """
+        network = self.network
+        cells = self.settings.hidden_cells
         if network is not None and cells != DEFAULT_HIDDEN_CELLS:
             raise ValueError(
                 f"settings.hidden_cells is {cells}; allowed: the default, because the algorithm has a "
@@ -112,59 +123,84 @@ class Algorithm(Value, stored=False):
         return new_network(network or MLP(hidden_cells=cells), spaces, outputs, **options)
 
     def new_networks(self, spaces: Spaces, **outputs: int) -> AgentNetworks:
-        """Return new networks by name, each with so many outputs; the acting one first."""
+        """Return several new networks of an agent, e.g. `new_networks(spaces, actor=7, critic=1)`.
+
+        Args:
+            outputs: the number of outputs of each network, by its name, the acting network first.
+        """
         return AgentNetworks({name: self.new_network(spaces, count) for name, count in outputs.items()})
 
     def make_network(self, spaces: Spaces) -> nn.Module:
-        """New networks of one agent, initialised from torch's generator. They map observations [..., *shape]
-        to [..., A]; several networks are `AgentNetworks`, the acting one first."""
+        """Return the new network of one agent, which maps observations [..., *shape] to [..., A].
+
+        Several networks are `AgentNetworks`, the acting one first. Weights are drawn from torch's global
+        generator, which the caller has seeded.
+        """
         raise NotImplementedError(f"{type(self).__name__} must define make_network(spaces)")
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-        """The networks of a team from those of its members: `AgentNetworks`, the acting
-        `cprl.networks.team.Team` first. Members that share parameters are one and the same network; added
-        networks are initialised from torch's generator."""
+        """Return the networks of a team: `AgentNetworks`, the acting `cprl.networks.team.TeamNetwork` first.
+
+        Args:
+            members: what `make_network` returned for each member; members that share parameters have the
+                same network. Networks that the team adds are drawn from torch's global generator.
+        """
         raise NotImplementedError(f"{type(self).__name__} must define make_team(members, spaces)")
 
     def make_loss(self, network: Any) -> LossModule:
-        """TorchRL's loss over networks of `make_network`."""
+        """Return TorchRL's loss over a network, or networks, that `make_network` or `make_team` returned."""
         raise NotImplementedError(f"{type(self).__name__} must define make_loss(network)")
 
-    def said_update(self) -> Update | None:
-        """The `update` that its class says, or the one it is a subclass of; None where none is said.
+    def declared_update(self) -> Update | None:
+        """Return the `update` that holds for this algorithm; None if no declaration does.
 
-        It is said of all that the class has, so it holds for subclasses that change the defaults of fields
-        alone, or add what their parent does not have. It is not said of a network or a loss of a user's.
+        A class declares `update` for the methods and the loss that it has. So the declaration holds for
+        subclasses only if they override nothing but defaults of fields. It does not hold for a network or a
+        loss of the user's.
         """
-        said_by = self._said_by()
-        return None if said_by is None else said_by.update
+        declaring_class = self._declaring_class()
+        return None if declaring_class is None else declaring_class.update
 
-    def _said_by(self) -> type["Algorithm"] | None:
-        """The class whose `update` holds for this algorithm."""
+    def _declaring_class(self) -> type["Algorithm"] | None:
+        """Return the class whose `update` holds for this algorithm, see `declared_update`."""
         if isinstance(self.network, Custom) or getattr(self, "loss", None) is not None:
             return None
-        kinds = type(self).__mro__
-        place = next(place for place, kind in enumerate(kinds) if "update" in vars(kind))
-        said_by: Any = kinds[place]
-        if said_by.update is None:
+        classes = type(self).__mro__
+        index = next(index for index, algorithm in enumerate(classes) if "update" in vars(algorithm))
+        declaring_class: Any = classes[index]
+        if declaring_class.update is None:
             return None
-        defined = {name for kind in kinds[:place] for name in vars(kind) if hasattr(said_by, name)}
-        defined -= {*hints_of(said_by), "_called"}
-        changes = any(not name.startswith("__") for name in defined)
-        return None if changes or kinds[place:] != said_by.__mro__ else said_by
+        overridden = {
+            name
+            for algorithm in classes[:index]
+            for name in vars(algorithm)
+            if hasattr(declaring_class, name)
+        }
+        overridden -= {*hints_of(declaring_class), "_called"}  # fields may have other defaults
+        overrides_methods = any(not name.startswith("__") for name in overridden)
+        has_other_bases = classes[index:] != declaring_class.__mro__
+        return None if overrides_methods or has_other_bases else declaring_class
 
-    def own_loss(self, loss: Custom, network: nn.Module) -> LossModule:
-        """Return the loss of a user's own over a network, or networks, of `make_network`."""
-        made = loss.make(network, self.settings)
-        if not isinstance(made, LossModule):
+    def custom_loss(self, loss: Custom, network: nn.Module) -> LossModule:
+        """Return a loss of the user's over the networks of `make_network`.
+
+        Raises:
+            ValueError: if it is not a `LossModule`.
+        """
+        module = loss.make(network, self.settings)
+        if not isinstance(module, LossModule):
             raise ValueError(
-                f"the loss {loss.target} is a {type(made).__name__}; allowed: a function of (network, "
+                f"the loss {loss.target} is a {type(module).__name__}; allowed: a function of (network, "
                 "settings) that returns a torchrl.objectives.LossModule"
             )
-        return made
+        return module
 
     def make_memory(self, lanes: Lanes, network: nn.Module, engine: TrainingEngine) -> Memory:
-        """What lanes learn from: a new `Replay` or `Rollouts`, for networks like this one of a lane."""
+        """Return the new memory of some lanes, a `Replay` or `Rollouts`.
+
+        Args:
+            network: the networks of one lane, for their architecture.
+        """
         raise NotImplementedError(f"{type(self).__name__} must define make_memory(lanes, network, engine)")
 
     def make_lane_networks(
@@ -175,33 +211,48 @@ class Algorithm(Value, stored=False):
         memory: Memory,
         engine: TrainingEngine,
     ) -> LaneNetworks | PlainNetworks:
-        """The networks of all lanes, made of those of each; without `targets` these start as copies."""
-        is_mean = getattr(self.settings, "mean_over_all_outputs", False)
-        rule = UpdateRule.of(self.settings, loss_share=1 / lanes.spaces.actions if is_mean else 1.0)
+        """Return the networks of all lanes, which act and learn together.
+
+        Args:
+            networks: the networks of each lane.
+            targets: the networks with each lane's initial target weights; None for copies of `networks`.
+            memory: the memory of the lanes, which makes synthetic batches to try losses with.
+        """
+        loss_share = 1.0
+        if getattr(self.settings, "mean_over_all_outputs", False):
+            loss_share = 1 / lanes.spaces.actions
+        rule = UpdateRule.of(self.settings, loss_share=loss_share)
         if engine == "torchrl":
-            made = PlainNetworks(networks, self.make_loss, rule, target_networks=targets)
+            plain_networks = PlainNetworks(networks, self.make_loss, rule, target_networks=targets)
             check_loss(self.make_loss(deepcopy(networks[0])), memory.example(1)[0])
-            return made
-        sharing, update, said_by = lanes.sharing, self.said_update(), self._said_by()
-        if update is None or said_by is None or not said_by.__module__.startswith("cprl."):
-            update = choose_update(networks, self.make_loss, memory.example, said=update, sharing=sharing)
+            return plain_networks
+        update = self.declared_update()
+        declaring_class = self._declaring_class()
+        is_from_cprl = declaring_class is not None and declaring_class.__module__.startswith("cprl.")
+        if update is None or not is_from_cprl:  # the declaration of a user's class is checked
+            update = choose_update(
+                networks, self.make_loss, memory.example, declared=update, sharing=lanes.sharing
+            )
         return LaneNetworks(
             networks,
             self.make_loss,
             rule,
             update=update,
             target_networks=targets,
-            sharing=sharing,
+            sharing=lanes.sharing,
             compile=engine == "compiled" and memory.sequence_steps <= COMPILED_STEPS,
         )
 
     def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> AnyLearner:
-        """The learner of these agents in every replica; raises a ValueError where the algorithm does not
-        support them, or the engine not the algorithm."""
+        """Return the learner of some agents in every replica.
+
+        Raises:
+            ValueError: if the algorithm does not support these agents, or the engine not the algorithm.
+        """
         return Learner(self, lanes, engine)
 
     def refuse_torchrl(self, engine: TrainingEngine) -> None:
-        """Raises a ValueError for the engine that trains independent agents alone."""
+        """Raise a ValueError if the engine is "torchrl", which supports only independent agents."""
         if engine == "torchrl":
             raise ValueError(
                 f'{type(self).__name__} does not support engine="torchrl", which trains independent agents '
@@ -211,10 +262,10 @@ class Algorithm(Value, stored=False):
 
 @dataclass(frozen=True, kw_only=True)
 class OffPolicy(Algorithm, stored=False):
-    """Learns from a replay buffer.
+    """The base of algorithms that learn from a replay buffer.
 
-    The loss reads transitions with "observation", "action" and "next": "observation", "reward" [.., 1],
-    "done", "terminated".
+    Their loss reads transitions: "observation", "action", and under "next" "observation", "reward" [.., 1],
+    "done" and "terminated".
     """
 
     settings: DQNSettings
@@ -223,24 +274,27 @@ class OffPolicy(Algorithm, stored=False):
     settings_kind: ClassVar[type[Any]] = DQNSettings
     can_share_parameters: ClassVar[bool] = True
     sees_peers_actions: ClassVar[bool] = False
-    """Whether "action" is [.., N] in place of [..]: first the agent's own action, then those of the others in
-    the order of their indices, whatever they learn by. Agents still act on their own observations alone."""
+    """True if the loss reads the actions of all N agents of the game: "action" is [.., N] in place of [..],
+    first the agent's own action, then the others' in the order of their indices. The others may learn by any
+    algorithm. Agents still act on their own observations alone."""
     noise_numbers: ClassVar[int] = 0
-    """How many uniform numbers in 0..1 the loss reads for each transition, of each member of a team, to
-    sample by: the entry "noise", float32 [.., noise_numbers] or [.., S, noise_numbers]. A loss that samples
-    by torch's generator instead would make replicas depend on each other."""
+    """The number of uniform numbers in 0..1 by which the loss samples, for each transition, or for each
+    member of a team in it: the entry "noise", float32 [.., noise_numbers] or [.., S, noise_numbers]. A loss
+    that drew from torch's global generator instead would make replicas depend on each other."""
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         relu = self.settings.relu_on_outputs
         return self.new_network(spaces, spaces.actions, relu_on_outputs=relu)
 
     def bootstrapped(self, loss: LossModule) -> LossModule:
-        """Return a loss, with targets that bootstrap after one step by the discount of the settings."""
+        """Return a loss after setting its target, r + gamma times the next value, with gamma of the
+        settings."""
         loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
         return loss
 
     def refuse_relu(self) -> None:
-        """Raises a ValueError for `relu_on_outputs`, of algorithms without Q values to act by."""
+        """Raise a ValueError if the settings have `relu_on_outputs`; for algorithms that do not act by Q
+        values."""
         if self.settings.relu_on_outputs:
             raise ValueError(
                 f"settings.relu_on_outputs is True; allowed for {type(self).__name__}, whose acting network "
@@ -252,26 +306,30 @@ class OffPolicy(Algorithm, stored=False):
             raise ValueError(
                 "sees_peers_actions is True; allowed for a team, whose actions are stored together: False"
             )
-        settings, members = self.settings, lanes.members
-        form = lanes.form(
-            action_shape=(lanes.spaces.agents,) if self.sees_peers_actions else members,
-            reward_shape=() if self.shares_reward else members,
-            noise_shape=(*members, self.noise_numbers) if self.noise_numbers else (),
-            horizon=Horizon(settings.n_steps, settings.gamma) if settings.n_steps > 1 else None,
-            state_cells=state_cells_of(acting_part(network)),
-            sequence_steps=settings.sequence_steps,
-        )
+        settings = self.settings
+        options: dict[str, Any] = {}
+        if self.sees_peers_actions:
+            options["action_shape"] = (lanes.spaces.agents,)
+        if self.shares_reward:
+            options["reward_shape"] = ()
+        if self.noise_numbers:
+            options["noise_shape"] = (*lanes.members, self.noise_numbers)
+        if settings.n_steps > 1:
+            options["horizon"] = Horizon(settings.n_steps, settings.gamma)
+        cells = state_cells_of(acting_network(network))
+        form = lanes.form(state_cells=cells, sequence_steps=settings.sequence_steps, **options)
         loss = self.make_loss(deepcopy(network))
-        kind = PlainReplay if engine == "torchrl" else Replay
-        return kind(lanes, settings, form, loss, stochastic=self.stochastic)
+        make_replay = PlainReplay if engine == "torchrl" else Replay
+        return make_replay(lanes, settings, form, loss, stochastic=self.stochastic)
 
 
 @dataclass(frozen=True, kw_only=True)
 class OnPolicy(Algorithm, stored=False):
-    """Learns from rollouts of the current policy.
+    """The base of algorithms that learn from rollouts of the current policy.
 
-    `make_network` returns `AgentNetworks`: "actor" outputs the policy's logits, "critic" one value. The loss
-    reads "observation", "action", "action_log_prob", "advantage", "value_target" and "state_value".
+    Their `make_network` returns `AgentNetworks`: "actor" outputs the policy's logits, "critic" one value.
+    Their loss reads "observation", "action", "action_log_prob", "advantage", "value_target" and
+    "state_value".
     """
 
     settings: RolloutSettings
@@ -285,17 +343,18 @@ class OnPolicy(Algorithm, stored=False):
         return self.new_networks(spaces, actor=spaces.actions, critic=1)
 
     def make_memory(self, lanes: Lanes, network: nn.Module, engine: TrainingEngine) -> Rollouts:
-        refuse_other_parts(network)
-        kind = PlainRollouts if engine == "torchrl" else Rollouts
-        return kind(lanes, self.settings, network, self.make_loss(deepcopy(network)))
+        refuse_other_networks(network)
+        make_rollouts = PlainRollouts if engine == "torchrl" else Rollouts
+        return make_rollouts(lanes, self.settings, network, self.make_loss(deepcopy(network)))
 
 
 class TeamAlgorithm(Algorithm, stored=False):
-    """Trains a team: agents that learn together and act independently, on their own observations.
+    """The base of algorithms that train a team: S agents that learn together and act on their own
+    observations.
 
-    `make_network` returns the networks of one member. The loss reads observations [.., S, *shape] and actions
-    [.., S] of S members. From replay, rewards are [.., 1], or [.., S, 1] where `shares_reward` is False; from
-    rollouts, advantages are [.., S, 1].
+    Their `make_network` returns the networks of one member. Their loss reads the observations [.., S, *shape]
+    and actions [.., S] of all members. Transitions from replay have rewards [.., 1], or [.., S, 1] if
+    `shares_reward` is False; rollouts have advantages [.., S, 1].
     """
 
     shares_reward: ClassVar[bool] = True
@@ -308,7 +367,7 @@ class TeamAlgorithm(Algorithm, stored=False):
         return Learner(self, replace(lanes, are_teams=True), engine)
 
     def check_team(self, members: int, reward: Reward) -> None:
-        """Raises a ValueError for a team that it cannot train, or another reward."""
+        """Raise a ValueError if the algorithm supports no team of this size, or not its reward."""
         name = type(self).__name__
         if self.shares_reward and reward != "team":
             raise ValueError(
@@ -323,10 +382,14 @@ class TeamAlgorithm(Algorithm, stored=False):
 
 
 def module_of(network: nn.Module, name: str, *, state: str = "recurrent_state") -> TensorDictModule:
-    """A network as a TensorDict module.
+    """Return a network as a TensorDict module that reads "observation".
+
+    A recurrent network also reads the states before each step and "is_init", and writes the states after
+    each step.
 
     Args:
-        state: the entry of the states before each step, of a recurrent network.
+        name: the entry that the outputs become.
+        state: the entry with the states before each step; the states after it get "_after" behind this name.
     """
     if state_shape_of(network) is None:
         return TensorDictModule(network, ["observation"], [name])
@@ -334,12 +397,12 @@ def module_of(network: nn.Module, name: str, *, state: str = "recurrent_state") 
 
 
 def q_actor(network: nn.Module) -> QValueActor:
-    """TorchRL's `QValueActor` with a network's outputs as action values."""
+    """Return TorchRL's `QValueActor` with a network's outputs as action values."""
     return QValueActor(module_of(network, "action_value"), spec=None, action_space="categorical")
 
 
 def policy(network: nn.Module) -> ProbabilisticTensorDictSequential:
-    """TorchRL's categorical policy with a network's outputs as logits."""
+    """Return TorchRL's `ProbabilisticActor` of a categorical policy with a network's outputs as logits."""
     return ProbabilisticActor(
         module_of(network, "logits"),
         in_keys=["logits"],
@@ -350,13 +413,18 @@ def policy(network: nn.Module) -> ProbabilisticTensorDictSequential:
 
 
 def actor_critic_loss(
-    network: AgentNetworks, kind: Callable[..., LossModule], **options: object
+    network: AgentNetworks, loss_class: Callable[..., LossModule], **options: object
 ) -> LossModule:
-    """Return a loss of TorchRL's over the "actor" and the "critic" of an agent or a team."""
+    """Return a loss of TorchRL's over the "actor" and the "critic" of an agent or a team.
+
+    Args:
+        loss_class: makes the loss of an actor and a critic, e.g. `A2CLoss`.
+        options: further arguments of it.
+    """
     critic = module_of(network["critic"], "state_value", state="critic_recurrent_state")
-    return kind(policy(network["actor"]), critic, **options)
+    return loss_class(policy(network["actor"]), critic, **options)
 
 
-def team_of(members: Sequence[nn.Module], spaces: Spaces) -> Team:
-    """Return the networks of the members of a team as one."""
-    return Team(members, observation_dims=len(spaces.observation_shape))
+def team_of(members: Sequence[nn.Module], spaces: Spaces) -> TeamNetwork:
+    """Return the networks of the members of a team as one network."""
+    return TeamNetwork(members, observation_dims=len(spaces.observation_shape))

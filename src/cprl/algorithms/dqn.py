@@ -24,7 +24,7 @@ class DQN(OffPolicy):
     """
 
     double: bool = False
-    """Whether the network itself, not its target, chooses the action whose value bootstraps (van Hasselt,
+    """True if the network itself, not its target, chooses the action whose value bootstraps (van Hasselt,
     Guez and Silver, "Deep Reinforcement Learning with Double Q-learning", 2016)."""
     loss_function: str = "l2"
     """The loss of the temporal-difference error d: "l2", d^2; "smooth_l1" (Huber); "l1"; or "log_cosh",
@@ -38,7 +38,7 @@ class DQN(OffPolicy):
 
     def make_loss(self, network: nn.Module) -> LossModule:
         if self.loss is not None:
-            return self.own_loss(self.loss, network)
+            return self.custom_loss(self.loss, network)
         is_ours = self.loss_function == LOG_COSH
         make = LogCoshDQNLoss if is_ours else partial(DQNLoss, loss_function=self.loss_function)
         loss = make(q_actor(network), delay_value=True, double_dqn=self.double, action_space="categorical")

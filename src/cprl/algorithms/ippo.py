@@ -26,8 +26,7 @@ class IPPO(TeamAlgorithm, Clipped):
     shares_reward = False
     update = "stacked"
 
-    def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-        of_each: Sequence[Any] = members
-        return AgentNetworks(
-            {name: team_of([member[name] for member in of_each], spaces) for name in ("actor", "critic")}
-        )
+    def make_team(self, members: Sequence[Any], spaces: Spaces) -> nn.Module:
+        actors = team_of([networks["actor"] for networks in members], spaces)
+        critics = team_of([networks["critic"] for networks in members], spaces)
+        return AgentNetworks({"actor": actors, "critic": critics})

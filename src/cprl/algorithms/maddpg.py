@@ -8,13 +8,13 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.objectives import LossModule
 
-from cprl.algorithms.base import OffPolicy, TeamAlgorithm, Weight, team_of
+from cprl.algorithms.base import Coefficient, OffPolicy, TeamAlgorithm, team_of
 from cprl.commons.spaces import Spaces
 from cprl.networks.agent import AgentNetworks
 from cprl.networks.mlp import MLP, MLPNetwork
 from cprl.networks.specification import Network
-from cprl.networks.team import JointCritics, Team
-from cprl.objectives.maddpg import NUMBERS, MADDPGLoss
+from cprl.networks.team import JointCritics, TeamNetwork
+from cprl.objectives.maddpg import NOISE_NUMBERS, MADDPGLoss
 from cprl.objectives.td import DISTANCES
 from cprl.values import Custom
 
@@ -28,22 +28,35 @@ class MADDPG(TeamAlgorithm, OffPolicy):
     the environment: critics see nothing of them. Members sample their actions from their policies, in
     training and in evaluation.
 
-    Source: Lowe et al., "Multi-Agent Actor-Critic for Mixed Cooperative-Competitive Environments" (2017); how
-    this differs is listed in docs/opponents.md.
+    Source: Lowe et al., "Multi-Agent Actor-Critic for Mixed Cooperative-Competitive Environments" (2017).
+    Departures from it:
+
+    1. The actor's gradient passes straight through a one-hot sample, not a Gumbel-softmax one.
+    2. The loss has 0.001 times the mean squared logit (`logit_penalty`), as in the authors' program, not
+       in the paper.
+    3. Next actions come from stochastic target policies, as in that program.
+    4. All members learn from one batch.
+    5. Gradients are not clipped.
+    6. There are no policy ensembles and no inferred policies.
+    7. The defaults are those of `DQNSettings`, not the paper's.
+    8. Running out of time does not end the sum of rewards.
+    9. Networks that are not fully connected give 32 features, joined with the actions.
+    10. With `share_parameters=True` members share the actor, not the critic.
     """
 
-    logit_penalty: Weight = 1e-3
+    logit_penalty: Coefficient = 1e-3
     """The weight of the mean squared logit in the actors' loss, 0..1e6; 1e-3 in the published program."""
     loss_function: str = "l2"
-    """The loss of the critics' temporal-difference errors, as `DQN.loss_function`."""
+    """The loss of the critics' temporal-difference errors, see `DQN.loss_function`."""
     network: Network | Custom | None = None
-    """As `DQN.network`. The critics' fully connected layers read observations and actions side by side.
-    Another network maps the observations of all members to as many features as the last of
-    `settings.hidden_cells` has units, and one more layer of that size joins them with the actions."""
+    """The architecture of the networks, see `DQN.network`. Critics of fully connected layers read the
+    observations and actions of all members as one vector. In critics of another architecture this network
+    maps the observations of all members to features, as many as the last layer of `settings.hidden_cells` has
+    units, and one more hidden layer of this size reads features and actions."""
     shares_reward = False
     fewest_members = 2
     stochastic = True
-    noise_numbers = NUMBERS
+    noise_numbers = NOISE_NUMBERS
     loss_functions = DISTANCES
     update = "stacked"
 
@@ -51,27 +64,29 @@ class MADDPG(TeamAlgorithm, OffPolicy):
         return self.new_network(spaces, spaces.actions)
 
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
-        return AgentNetworks(
-            {"actor": team_of(members, spaces), "critic": self._critics(len(members), spaces)}
-        )
+        critics = self._critics(len(members), spaces)
+        return AgentNetworks({"actor": team_of(members, spaces), "critic": critics})
 
     def _critics(self, members: int, spaces: Spaces) -> JointCritics:
+        """Return a new critic for each member, of what all members observe and do."""
         everything = members, *spaces.observation_shape
-        dims, joint = len(everything), members * spaces.actions
-        cells, encoders, features = self.settings.hidden_cells, None, prod(everything)
+        cells = self.settings.hidden_cells
+        encoders = None
+        features = prod(everything)
         if isinstance(self.network, MLP):
             cells = self.network.hidden_cells
         elif self.network is not None:
-            features, cells = cells[-1], cells[-1:]
+            features = cells[-1]
+            cells = cells[-1:]
             each = [self.new_network(spaces, features, shape=everything) for _ in range(members)]
-            encoders = Team(each, observation_dims=dims)
+            encoders = TeamNetwork(each, observation_dims=len(everything))
         options = {name: getattr(self.settings, name) for name in ("relu_on_outputs", "glorot_uniform")}
-        shape = (features + joint,)
+        shape = (features + members * spaces.actions,)
         heads = [MLPNetwork(shape, 1, hidden_cells=cells, highest=1.0, **options) for _ in range(members)]
         return JointCritics(
-            Team(heads, observation_dims=1),
+            TeamNetwork(heads, observation_dims=1),
             encoders,
-            observation_dims=dims - 1,
+            observation_dims=len(spaces.observation_shape),
             highest=spaces.observation_scale,
         )
 

@@ -30,6 +30,5 @@ class MAPPO(TeamAlgorithm, Clipped):
     def make_team(self, members: Sequence[nn.Module], spaces: Spaces) -> nn.Module:
         everything = len(members), *spaces.observation_shape
         critic = self.new_network(spaces, 1, shape=everything)
-        return AgentNetworks(
-            {"actor": team_of(members, spaces), "critic": CentralCritic(critic, len(members))}
-        )
+        actor = team_of(members, spaces)
+        return AgentNetworks({"actor": actor, "critic": CentralCritic(critic, len(members))})

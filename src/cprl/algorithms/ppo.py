@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from torchrl.objectives import ClipPPOLoss, LossModule
 
-from cprl.algorithms.base import OnPolicy, Weight, actor_critic_loss
+from cprl.algorithms.base import Coefficient, OnPolicy, actor_critic_loss
 from cprl.networks.agent import AgentNetworks
 from cprl.values import Custom, Range
 
@@ -15,12 +15,12 @@ ClipEpsilon = Annotated[float, Range(1e-6, 0.999)]
 
 @dataclass(frozen=True, kw_only=True)
 class Clipped(OnPolicy, stored=False):
-    """What algorithms with a clipped ratio have in common."""
+    """The base of algorithms with a clipped ratio."""
 
     clip_epsilon: ClipEpsilon = 0.2
     """The largest change of an action's probability, as a ratio minus 1."""
-    entropy_coeff: Weight = 0.01
-    critic_coeff: Weight = 0.5
+    entropy_coeff: Coefficient = 0.01
+    critic_coeff: Coefficient = 0.5
     can_be_recurrent = True
     loss_kind: ClassVar[Callable[..., LossModule]]
     """TorchRL's loss."""
@@ -52,5 +52,5 @@ class PPO(Clipped):
 
     def make_loss(self, network: AgentNetworks) -> LossModule:
         if self.loss is not None:
-            return self.own_loss(self.loss, network)
+            return self.custom_loss(self.loss, network)
         return super().make_loss(network)

@@ -8,7 +8,7 @@ from torchrl.objectives import LossModule
 
 from cprl.algorithms.base import OffPolicy
 from cprl.commons.spaces import Spaces
-from cprl.networks.agent import JointNetwork, OtherOutputs
+from cprl.networks.agent import JointNetwork, MethodModule
 from cprl.objectives.pr2 import PR2Loss
 from cprl.objectives.td import DISTANCES
 from cprl.values import Range
@@ -26,15 +26,24 @@ class PR2(OffPolicy):
     the agent and a peer. The peers may learn by anything, or not at all.
 
     Source: Wen et al., "Probabilistic Recursive Reasoning for Multi-Agent Reinforcement Learning" (2019).
+    Departures from it:
+
+    1. Actions are discrete, and sums over them are exact.
+    2. With more than two agents joint values are sums over pairs.
+    3. The temperature is a hyperparameter; the paper's is 1 with scaled rewards.
+    4. One network gives policy and conditional.
+    5. Next values are the target network's soft values; `entropy_bonus=False` is new.
+    6. Agents are updated at the same time, each from its own replay.
     """
 
     temperature: Temperature = 0.1
-    """Of the policy and of the peers' expected answers, in units of reward (apples), 1e-6..1e6."""
+    """The temperature of the policy and of the peers' expected answers, in units of reward (apples),
+    1e-6..1e6."""
     entropy_bonus: bool = True
-    """Whether values contain the entropy of the joint action, as in the paper, which pays agents for every
+    """True if values contain the entropy of the joint action, as in the paper, which pays agents for every
     step that they live; see `PR2Loss`."""
     loss_function: str = "l2"
-    """As `DQN.loss_function`."""
+    """The loss of the temporal-difference error, see `DQN.loss_function`."""
     stochastic = True
     sees_peers_actions = True
     loss_functions = DISTANCES
@@ -46,14 +55,15 @@ class PR2(OffPolicy):
                 f"{type(self).__name__} learns from the actions of its peers, and the game has "
                 f"{spaces.agents} agent; allowed: games of 2 agents or more; for one agent use DQN or SAC"
             )
-        peers, actions = spaces.agents - 1, spaces.actions
-        options = {"relu_on_outputs": self.settings.relu_on_outputs}
-        values = self.new_network(spaces, peers * actions * actions, **options)
+        peers = spaces.agents - 1
+        actions = spaces.actions
+        relu = self.settings.relu_on_outputs
+        values = self.new_network(spaces, peers * actions * actions, relu_on_outputs=relu)
         return JointNetwork(values, actions=actions, peers=peers, temperature=self.temperature)
 
     def make_loss(self, network: JointNetwork) -> LossModule:
         loss = PR2Loss(
-            OtherOutputs(network, "joint_values"),
+            MethodModule(network, "joint_values"),
             temperature=self.temperature,
             entropy_bonus=self.entropy_bonus,
             loss_function=self.loss_function,

@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 from cprl.algorithms.base import Algorithm, TrainingEngine
 from cprl.commons.spaces import Spaces
-from cprl.learners.base import AnyLearner
 from cprl.learners.lanes import Lanes
+from cprl.learners.protocol import AnyLearner
 from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularLearner, table_network
 from cprl.policies.tabular import TableNetwork

@@ -15,7 +15,9 @@ from cprl.commons.spaces import Spaces
 from cprl.networks.agent import AgentNetworks
 
 CHOSEN: Final = "chosen_action_value"
-_OF_TEAM: Final = "team_value"
+"""The entry with the values of the members' chosen actions, [.., S, 1]."""
+_TEAM_VALUE: Final = "team_value"
+"""The entry with the value of the team, [.., 1]."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,13 +37,17 @@ class VDN(TeamAlgorithm, OffPolicy):
         return self.bootstrapped(mixed_loss(network, [CHOSEN]))
 
 
-def mixed_loss(network: AgentNetworks, seen_by_mixer: Sequence[str]) -> LossModule:
-    """`QMixerLoss` over a team's "actor" and "mixer", with entries at the root of the TensorDict."""
+def mixed_loss(network: AgentNetworks, mixer_keys: Sequence[str]) -> LossModule:
+    """Return `QMixerLoss` over a team's "actor" and "mixer", with entries at the root of the TensorDict.
+
+    Args:
+        mixer_keys: the entries that the mixer reads.
+    """
     loss = QMixerLoss(
         q_actor(network["actor"]),
-        TensorDictModule(network["mixer"], list(seen_by_mixer), [_OF_TEAM]),
+        TensorDictModule(network["mixer"], list(mixer_keys), [_TEAM_VALUE]),
         delay_value=True,
         action_space="categorical",
     )
-    loss.set_keys(action="action", action_value="action_value", local_value=CHOSEN, global_value=_OF_TEAM)
+    loss.set_keys(action="action", action_value="action_value", local_value=CHOSEN, global_value=_TEAM_VALUE)
     return loss

@@ -1,7 +1,9 @@
-"""Values as flags: each field of an experiment that words can say, e.g. --game.rules.freeze-steps 50.
+"""Flags of the command line: shared arguments of commands, and flags for every field of an experiment.
 
-tyro reads dataclasses itself. The rule here tells it what it cannot know of a value that is there already: of
-which class each part is, and what no word can say and therefore stays.
+A recipe makes an experiment, and flags such as `--game.rules.freeze-steps 50` change it. tyro makes flags
+from the annotations of a dataclass. `ValueFlags` tells tyro two things that annotations do not say: the class
+of each part of the experiment at hand, e.g. DQN for an algorithm, and which fields no word can describe.
+These fields keep their values.
 """
 
 import inspect
@@ -18,7 +20,7 @@ from tyro.constructors import ConstructorRegistry, StructConstructorSpec, Struct
 
 from cprl.commons.published import Variant
 from cprl.system.output import say
-from cprl.values import Custom, fits, hints_of, refusal
+from cprl.values import Custom, hints_of, matches_type, refusal
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -26,21 +28,21 @@ if TYPE_CHECKING:
     from cprl.experiment import Experiment
     from cprl.institutions import Institution
     from cprl.population import AgentSpec
-    from cprl.terminal.tables import Cells
+    from cprl.terminal.text_tables import TextTable
 
 
 NO_DEFAULT: Final = tyro.conf.arg(help_behavior_hint="")
-"""Of a flag whose default says nothing: its text says what happens without it."""
+"""The setting of a flag whose help shows no default; the text of the flag says what happens without it."""
 
 
-Run = Annotated[
+RunArgument = Annotated[
     Path,
     tyro.conf.arg(
         metavar="RUN",
         help="The run's directory, or its results; of one that has not ended the newest checkpoint plays.",
     ),
 ]
-Runs = Annotated[
+RunsArgument = Annotated[
     tuple[str, ...],
     tyro.conf.arg(
         metavar="RUN [RUN ...]",
@@ -48,7 +50,7 @@ Runs = Annotated[
         help_behavior_hint="",
     ),
 ]
-Board = Annotated[
+BoardArgument = Annotated[
     str,
     tyro.conf.arg(
         metavar="BOARD",
@@ -61,7 +63,7 @@ VariantFlag = Annotated[
     tyro.conf.arg(help="Of the boards with a name: published or as_run; see docs/game.md."),
 ]
 ROWS: Final = ".parquet"
-"""What the name of a file with every row ends in."""
+"""The suffix of a file that holds every row of a table."""
 
 
 def _hint(default: str) -> str:
@@ -69,18 +71,27 @@ def _hint(default: str) -> str:
 
 
 def with_help(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function whose flags, with those of its dataclasses, have their texts in lines as wide as the
-    terminal, and show no default that is None or ()."""
+    """Prepare a function for the help of tyro, and return it.
+
+    The texts of its flags, and of the flags of its dataclasses, are joined to single lines, which tyro then
+    wraps at the width of the terminal. Defaults that are None or () are not shown.
+    """
     parameters = inspect.signature(function).parameters
     _describe(function, {name: parameter.default for name, parameter in parameters.items()})
     for parameter in parameters.values():
         if is_dataclass(parameter.default):
-            of_class = {field.name: field.default for field in fields(parameter.default)}
-            _describe(type(parameter.default), of_class)
+            defaults = {field.name: field.default for field in fields(parameter.default)}
+            _describe(type(parameter.default), defaults)
     return function
 
 
 def _describe(owner: Any, defaults: Mapping[str, Any]) -> None:
+    """Copy the texts of a docstring into the annotations of the flags.
+
+    Args:
+        owner: a function or a dataclass.
+        defaults: the default of each flag.
+    """
     from docstring_parser import parse_from_object  # as tyro does
 
     for base in getattr(owner, "__mro__", (owner, object))[:-1]:  # all but object
@@ -89,12 +100,13 @@ def _describe(owner: Any, defaults: Mapping[str, Any]) -> None:
         for name in inspect.get_annotations(base):
             is_empty = name in defaults and (defaults[name] is None or defaults[name] == ())
             text = " ".join(texts.get(name, "").split()) or None
-            flag = tyro.conf.arg(help=text, help_behavior_hint="" if is_empty else None)
+            hint = "" if is_empty else None
+            flag = tyro.conf.arg(help=text, help_behavior_hint=hint)
             base.__annotations__[name] = Annotated[hints[name], flag]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Tables:
+class TableFiles:
     """Which files of tables are written; none is written over."""
 
     out: tyro.conf.UseAppendAction[tuple[Path, ...]] = ()
@@ -104,47 +116,51 @@ class Tables:
     """Print every row as CSV, and nothing else."""
 
     def check(self) -> None:
-        """Refuse what cannot be written before hours of work."""
+        """Refuse files that cannot be written, before hours of work."""
         from cprl.runs.files import refuse_to_write_over
-        from cprl.terminal.tables import SUFFIXES
+        from cprl.terminal.text_tables import WRITERS
 
         others = [name for name, value in vars(self).items() if value and name not in ("csv", "figure_width")]
         if self.csv and others:
             cure = others[0] + ", as --out FILE.csv writes means and intervals" * (others[0] == "out")
             raise ValueError(f"--csv prints every row and nothing else; allowed: without --{cure}")
         for path in self.out:
-            if path.suffix not in (ROWS, *SUFFIXES):
-                raise refusal("--out", str(path), f"a name that ends in {', '.join((ROWS, *SUFFIXES))}")
+            if path.suffix not in (ROWS, *WRITERS):
+                raise refusal("--out", str(path), f"a name that ends in {', '.join((ROWS, *WRITERS))}")
             if self.out.count(path) > 1:
                 raise refusal("--out", str(path), "each file once")
             refuse_to_write_over(path)
 
-    def write(self, rows: "pa.Table", tables: "Sequence[Cells]" = (), *, notes: Sequence[str] = ()) -> None:
-        """Write the files, and say so.
+    def write(
+        self, rows: "pa.Table", tables: "Sequence[TextTable]" = (), *, notes: Sequence[str] = ()
+    ) -> None:
+        """Write the files, and print their names.
 
         Args:
-            rows: of a .parquet.
-            tables: of the other files, with notes below them.
+            rows: the rows of a .parquet file.
+            tables: the tables of the other files.
+            notes: lines below the tables.
         """
         from cprl.runs.episodes import write_table
-        from cprl.terminal.tables import write
+        from cprl.terminal.text_tables import write_tables
 
         for path in self.out:
             if path.suffix == ROWS:
                 write_table(path, rows)
             else:
-                write(tables, path, notes=notes)
+                write_tables(tables, path, notes=notes)
             say(f"Written: {path}")
 
 
 @dataclass(frozen=True, kw_only=True)
-class Files(Tables):
+class ResultFiles(TableFiles):
     """Which files of tables and figures are written; none is written over."""
 
     figure: Path | None = None
     """A new .png, .pdf or .svg, see docs/evaluation.md."""
     figure_width: Literal["page", "column"] = "page"
-    """Of the figure: a page, or a column of a paper, 3.3 inches, with its caption in a file beside it."""
+    """The width of the figure: a page, or a column of a paper, 3.3 inches, with its caption in a file beside
+    it."""
 
     def check(self) -> None:
         super().check()
@@ -154,21 +170,21 @@ class Files(Tables):
             check_picture(self.figure, "--figure")
 
 
-TableFlags = Annotated[Tables, tyro.conf.arg(name="")]
-FileFlags = Annotated[Files, tyro.conf.arg(name="")]
+TableFlags = Annotated[TableFiles, tyro.conf.arg(name="")]
+FileFlags = Annotated[ResultFiles, tyro.conf.arg(name="")]
 
 
 class RefusedError(Exception):
-    """A value that words describe is refused; of no kind that tyro wraps into a text of its own."""
+    """A value on the command line is refused. It is no ValueError, since tyro rewrites their texts."""
 
 
 class ValueFlags(ConstructorRegistry):
-    """How tyro reads the fields of a dataclass that has a default: as changes to it.
+    """A rule for tyro: the flags of a dataclass that has a default value change that value.
 
     Args:
-        listed: the places that help lists, or what is above them; None for all. Help lists what stands in a
-            tuple once, though equal ones are there.
-        is_help: whether words ask for help, which alone leaves flags out.
+        listed: the paths of the fields that help lists; None for all. Of equal values in a tuple, help lists
+            the first one only.
+        is_help: whether the command line asks for help. Otherwise no flag is left out.
     """
 
     def __init__(self, listed: Collection[str] | None = None, *, is_help: bool = False) -> None:
@@ -180,30 +196,37 @@ class ValueFlags(ConstructorRegistry):
         self.struct_rule(self._changes)
 
     def _changes(self, info: StructTypeInfo) -> StructConstructorSpec | None:
-        value: Any = info.default
-        if self._is_inside or isinstance(value, type) or not is_dataclass(value):
+        """Return how tyro reads a dataclass with a default value; None for any other type."""
+        is_instance = is_dataclass(info.default) and not isinstance(info.default, type)
+        if self._is_inside or not is_instance:
             return None
+        instance: Any = info.default
         self._is_inside = True  # in what tyro's own rule says of a dataclass: defaults and help
         try:
             usual = ConstructorRegistry.get_struct_spec(info)
         finally:
             self._is_inside = False
         assert isinstance(usual, StructConstructorSpec)
-        settable = {field.name for field in fields(value) if field.init}
-        place = self._places.get(id(value), "")
-        made: Any = value
+        settable = {field.name for field in fields(instance) if field.init}
+        place = self._places.get(id(instance), "")
         flags = [self._flag(field, place) for field in usual.fields if field.name in settable]
 
-        def changed(**given: Any) -> Any:
-            changes = {name: new for name, new in given.items() if new != getattr(value, name)}
+        def changed(**settings: Any) -> Any:
+            changes = {name: new for name, new in settings.items() if new != getattr(instance, name)}
             try:
-                return replace(made, **changes) if changes else made
+                return replace(instance, **changes) if changes else instance
             except ValueError as error:
                 raise RefusedError(str(error)) from error
 
         return StructConstructorSpec(instantiate=changed, fields=tuple(flag for flag in flags if flag))
 
     def _flag(self, field: StructFieldSpec, above: str) -> StructFieldSpec | None:
+        """Return the flag of a field; None if no word can describe its value.
+
+        Args:
+            field: the field, as tyro's own rule describes it.
+            above: the path of the dataclass that has the field.
+        """
         value = field.default
         place = f"{above}.{field.name}".lstrip(".")
         kind: Any
@@ -224,7 +247,7 @@ class ValueFlags(ConstructorRegistry):
             kind = tuple[tuple(kinds)]  # type: ignore[misc]
         else:
             kind = _simple(field.type)
-            kind = None if kind in (None, NoneType) or not fits(value, kind) else kind
+            kind = None if kind in (None, NoneType) or not matches_type(value, kind) else kind
         if kind is None:
             return None
         if value is None or value == ():
@@ -245,7 +268,8 @@ _WORDS: Final = (bool, int, float, str, NoneType)
 
 
 def _simple(hint: Any) -> Any:
-    """A type without objects, tables and nested tuples; None if nothing is left."""
+    """Return the part of a type that words can describe, without objects, tables and nested tuples; None if
+    nothing is left."""
     origin = get_origin(hint)
     arguments = get_args(hint)
     if origin is Annotated:
@@ -262,13 +286,13 @@ def _simple(hint: Any) -> Any:
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """What decides which other flags there are, and is therefore read first."""
+    """Flags that decide which other flags exist. They are parsed first."""
 
     map: Annotated[str | None, tyro.conf.arg(name="game.map", metavar="NAME")] = None
     """A board by its name: single_basic, single_complex, two_complex or commons."""
     agents: int | None = None
-    """How many agents, where all are alike. A board has its first starts then, or more of them on free ground
-    around the first one."""
+    """The number of agents, where all are alike. A board has its first starts then, or more of them on free
+    ground around the first one."""
     institutions: Annotated[
         tuple[str, ...],
         tyro.conf.arg(name="game.institutions", metavar="NAME|FILE.json", help_behavior_hint=_hint),
@@ -278,7 +302,7 @@ class Shape:
 
 
 def in_shape(experiment: "Experiment", shape: Shape) -> "Experiment":
-    """Return an experiment on another board, with another number of agents or under other institutions."""
+    """Return the experiment with another board, number of agents or institutions, as the flags say."""
     from cprl.commons import maps
     from cprl.commons.game import Game
 
@@ -288,7 +312,7 @@ def in_shape(experiment: "Experiment", shape: Shape) -> "Experiment":
     agents = experiment.agents
     if not isinstance(game, Game):
         raise ValueError("--game.map, --agents and --game.institutions are for games on a board of cprl")
-    board = game.map if shape.map is None else maps.named(shape.map)
+    board = game.map if shape.map is None else maps.published(shape.map)
     if shape.agents is not None:
         board = maps.with_agents(board, shape.agents)
         agents = _as_many(agents, shape.agents)
@@ -297,6 +321,7 @@ def in_shape(experiment: "Experiment", shape: Shape) -> "Experiment":
 
 
 def _as_many(specs: "tuple[AgentSpec, ...]", agents: int) -> "tuple[AgentSpec, ...]":
+    """Return the specifications of another number of agents; refuse agents that are not alike."""
     from cprl.population import Team
 
     first = specs[0]
@@ -309,27 +334,32 @@ def _as_many(specs: "tuple[AgentSpec, ...]", agents: int) -> "tuple[AgentSpec, .
     return (first,) * agents
 
 
-def _institutions(words: Sequence[str]) -> "tuple[Institution, ...]":
+def _institutions(names: Sequence[str]) -> "tuple[Institution, ...]":
+    """Return institutions by name, with their defaults, or from JSON files; ["none"] means no institution."""
     from cprl.institutions import Institution
     from cprl.values import KINDS, from_config
 
     kinds = {_snake(name): kind for name, kind in KINDS.items() if issubclass(kind, Institution)}
-    made: list[Institution] = []
-    for word in () if tuple(words) == ("none",) else words:
-        if word.endswith(".json"):
-            tables = json.loads(Path(word).read_text(encoding="utf-8"))
-            for number, table in enumerate(tables if isinstance(tables, list) else [tables]):
-                made.append(from_config(table, f"{word}[{number}]"))
-        elif word.replace("-", "_") not in kinds:
+    institutions: list[Institution] = []
+    if list(names) == ["none"]:
+        return ()
+    for name in names:
+        kind = kinds.get(name.replace("-", "_"))
+        if name.endswith(".json"):
+            content = json.loads(Path(name).read_text(encoding="utf-8"))
+            tables = content if isinstance(content, list) else [content]
+            for number, table in enumerate(tables):
+                institutions.append(from_config(table, f"{name}[{number}]"))
+        elif kind is None:
             raise ValueError(
-                f"--game.institutions is {word}; allowed: {', '.join(sorted(kinds))}, a file .json, or none"
+                f"--game.institutions is {name}; allowed: {', '.join(sorted(kinds))}, a file .json, or none"
             )
         else:
             try:
-                made.append(kinds[word.replace("-", "_")]())
+                institutions.append(kind())
             except TypeError as error:  # without an argument that has no default
-                raise ValueError(f"--game.institutions is {word}, {error}; allowed: a file .json") from error
-    return tuple(made)
+                raise ValueError(f"--game.institutions is {name}, {error}; allowed: a file .json") from error
+    return tuple(institutions)
 
 
 def _snake(name: str) -> str:
@@ -337,8 +367,11 @@ def _snake(name: str) -> str:
 
 
 def with_groups(experiment: "Experiment", flags: Sequence[str]) -> "Experiment":
-    """Return an experiment with the groups of rules that it lacks and whose fields words of a command line
-    set, e.g. --game.rules.random-end.prob 0.15."""
+    """Return the experiment with the groups of rules that the flags need.
+
+    A group of rules, e.g. `Rules.random_end`, is None by default. A flag for one of its fields, such as
+    `--game.rules.random-end.prob 0.15`, needs the group to exist before tyro reads the flags.
+    """
     from cprl.commons.game import Game
 
     game = experiment.game
@@ -355,7 +388,7 @@ def with_groups(experiment: "Experiment", flags: Sequence[str]) -> "Experiment":
 
 
 def _group(kind: Any, flag: str, said: Collection[str]) -> Any:
-    """Make a group of rules of which words set some fields, all that it requires among them."""
+    """Return a group of rules; refuse unknown fields, and required fields that no flag sets."""
     known = [field.name for field in fields(kind)]
     for name in said:
         if name.removeprefix("no_") not in known:
@@ -367,32 +400,36 @@ def _group(kind: Any, flag: str, said: Collection[str]) -> Any:
     lacking = [name for name in required if name not in said]
     if lacking:
         raise ValueError(f"{flag} lacks {', '.join(lacking)}, which {kind.__name__} requires")
-    return kind(**dict.fromkeys(required, 1))  # which the words replace
+    return kind(**dict.fromkeys(required, 1))  # placeholders, which the flags replace
 
 
 def shape_of(experiment: "Experiment") -> Shape:
+    """Return the shape of an experiment, for the defaults that help shows."""
     from cprl.commons import maps
     from cprl.commons.game import Game
 
     game = experiment.game
     if not isinstance(game, Game):
         return Shape()
-    names = [name for name in maps.NAMES if maps.named(name) == game.map]
-    return Shape(
-        map=names[0] if names else "as drawn", agents=game.agents, institutions=tuple(_kinds(experiment))
-    )
+    names = [name for name in maps.NAMES if maps.published(name) == game.map]
+    board = next(iter(names), "as drawn")
+    return Shape(map=board, agents=game.agents, institutions=tuple(_kinds(experiment)))
 
 
-def numbered(words: Sequence[str], experiment: "Experiment") -> list[str]:
-    """Return words whose flags of institutions have a number in place of a name."""
+def with_numbers(words: Sequence[str], experiment: "Experiment") -> list[str]:
+    """Return the words with indices for the names of institutions.
+
+    For example, `--game.institutions.quota.share` becomes `--game.institutions.0.share`.
+    """
     above = "--game.institutions."
     kinds = _kinds(experiment)
     changed = []
     for word in words:
         name, dot, field = word.removeprefix(above).partition(".")
-        is_name = word.startswith(above) and kinds.count(name.replace("-", "_")) == 1
-        number = kinds.index(name.replace("-", "_")) if is_name else 0
-        changed.append(f"{above}{number}{dot}{field}" if is_name else word)
+        kind = name.replace("-", "_")
+        if word.startswith(above) and kinds.count(kind) == 1:
+            word = f"{above}{kinds.index(kind)}{dot}{field}"
+        changed.append(word)
     return changed
 
 

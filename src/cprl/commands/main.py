@@ -15,60 +15,64 @@ from typing import Annotated, Any, Final, Literal
 
 import tyro
 
-from cprl.commands import play_stored
 from cprl.commands.flags import with_help
-from cprl.commands.recipe import (
+from cprl.commands.recipe_command import (
     ALLOW,
     RunOptions,
     ended_by_sigterm,
-    in_a_sentence,
+    exit_with_message,
     refuse_mistyped_flags,
     run_with,
     trust_allowed,
-    wrapped,
+    wrap_paragraphs,
 )
 from cprl.system.defaults import FILM_SEED
-from cprl.system.output import OUT, printed, say
+from cprl.system.output import OUT, quote_command, say
 from cprl.system.process import obey_parent
 from cprl.system.shipped import PROGRAM, is_shipped, recipe_named, run_shipped, shipped_recipes
+from cprl.system.waiting_room import EXPERIMENTAL_COMMANDS as EXPERIMENTAL, experimental
 from cprl.system.working import working
-from cprl.values import meant
+from cprl.values import did_you_mean
 
-GROUPS: Final[Mapping[str, Mapping[str, str]]] = {
+_GROUPS: Final[Mapping[str, Mapping[str, str]]] = {
     "Train": {
-        "run": "main:run",
-        "recipe": "main:recipe",
-        "sweep": "studies:sweep",
-        "search": "studies:search",
+        "run": "main",
+        "recipe": "main",
+        "sweep": "studies",
     },
     "Look": {
-        "watch": "main:watch",
-        **{name: f"play_stored:{name}" for name in play_stored.LOOK},
+        "watch": "main",
+        "film": "play_stored",
+        "show": "play_stored",
+        "report": "play_stored",
+        "play": "play_stored",
     },
     "Measure": {
-        **{name: f"play_stored:{name}" for name in play_stored.MEASURE},
-        "export": "main:export",
+        "evaluate": "play_stored",
+        "scenarios": "play_stored",
+        "export": "main",
     },
     "Compare": {
-        "table": "table:table",
-        **{name: f"play_stored:{name}" for name in play_stored.COMPARE},
+        "table": "table_command",
+        "crossplay": "play_stored",
     },
 }
-"""The functions of the commands, each in a module of this package, in the order in which `cprl --help` lists
-them."""
-COMMANDS: Final = {name: place for group in GROUPS.values() for name, place in group.items()}
-"""Those of all groups. A command imports what it needs once its words are checked: torch takes seconds,
-which a mistake need not."""
+"""The commands in the order in which `cprl --help` lists them, each with the module of this package that has
+a function of that name."""
+_MODULES: Final = {name: module for group in _GROUPS.values() for name, module in group.items()}
+COMMANDS: Final = (*_MODULES, *EXPERIMENTAL)
+"""The names of all commands. A command imports torch, which takes seconds, after its words are checked."""
 
 _OPTIONS: Final = RunOptions()
 _TRIAL: Final[ContextVar[Path | None]] = ContextVar("trial", default=None)
-"""--trial FILE of `cprl run` where a study started it, which is in no help: the run says there every second
-how far it is, draws no figure, and ends with the process that has its standard input."""
+"""The file of `cprl run --trial FILE`, a flag that no help lists: it means that a study started this process.
+The run then writes its status to the file every second, draws no figure, and ends if the study's process
+dies."""
 _ARGS: Final = "\n\nArgs:"
 
 
 def main() -> None:
-    """Carry out the command line; what cannot be done is said in a line, and ends with exit code 1."""
+    """Run the command of the command line; errors become a message and an exit code."""
     words = sys.argv[1:]
     if words == ["--version"]:
         from importlib.metadata import version
@@ -78,42 +82,62 @@ def main() -> None:
         _print_help()
         sys.exit(0)
     elif words[0] not in COMMANDS:
-        hint = meant(words[0], COMMANDS)
+        hint = did_you_mean(words[0], COMMANDS)
         print(
             f"cprl: there is no command {words[0]!r}{hint}; allowed: {', '.join(COMMANDS)}", file=sys.stderr
         )
         sys.exit(2)
     elif words[0] in ("sweep", "search"):  # whose flags are those of a recipe
-        with in_a_sentence(f"cprl {words[0]}"):
+        with exit_with_message(f"cprl {words[0]}"):
             _function(words[0])(words[1:])
     elif words[0] != "run" or not _is_run_by_name(words[1:]):
-        with in_a_sentence("cprl"), ended_by_sigterm():
-            function = _function(words[0])
-            function = with_help(function) if {"-h", "--help"} & {*words} else function
-            about = wrapped(f"{(getdoc(function) or '').partition(_ARGS)[0].strip()}\n\n{ALLOW}")
-            config = (tyro.conf.HelptextFromCommentsOff, tyro.conf.DisallowNone)
-            others = trust_allowed(words[1:])
-            if words[0] == "run" and "--trial" in others[:-1]:
-                place = others.index("--trial")
-                _TRIAL.set(Path(others[place + 1]))
-                del others[place : place + 2]
-            tyro.cli(function, args=others, prog=f"cprl {words[0]}", description=about, config=config)
+        with exit_with_message("cprl"), ended_by_sigterm():
+            _call_with_flags(words[0], words[1:])
+
+
+def _call_with_flags(command: str, words: Sequence[str]) -> None:
+    """Call the function of a command with the flags that tyro reads from the words."""
+    function = _function(command)
+    if {"-h", "--help"} & {*words}:
+        function = with_help(function)
+    text = (getdoc(function) or "").partition(_ARGS)[0].strip()
+    flags = trust_allowed(words)
+    if command == "run" and "--trial" in flags[:-1]:
+        index = flags.index("--trial")
+        _TRIAL.set(Path(flags[index + 1]))
+        del flags[index : index + 2]
+    tyro.cli(
+        function,
+        args=flags,
+        prog=f"cprl {command}",
+        description=wrap_paragraphs(f"{text}\n\n{ALLOW}"),
+        config=(tyro.conf.HelptextFromCommentsOff, tyro.conf.DisallowNone),
+    )
 
 
 def _function(command: str) -> Callable[..., Any]:
-    module, _, name = COMMANDS[command].partition(":")
-    function: Callable[..., Any] = getattr(import_module(f"cprl.commands.{module}"), name)
+    """Import and return the function of a command."""
+    if command in EXPERIMENTAL:
+        function: Callable[..., Any] = experimental(command)
+    else:
+        function = getattr(import_module(f"cprl.commands.{_MODULES[command]}"), command)
     return function
 
 
 def _print_help() -> None:
-    lines = ["usage: cprl [-h] [--version] COMMAND ...", "", wrapped(__doc__ or "")]
-    for group, names in GROUPS.items():
+    """Print the commands by their groups, each with the first paragraph of its docstring."""
+    lines = ["usage: cprl [-h] [--version] COMMAND ...", "", wrap_paragraphs(__doc__ or "")]
+    for group, names in _GROUPS.items():
         lines += ["", f"{group}:"]
         for name in names:
             about = (getdoc(_function(name)) or "").partition("\n\n")[0]
-            lines.append(wrapped(about, before=f"  {name:<10}  "))
-    say("\n".join([*lines, "", "cprl COMMAND --help lists the flags of a command."]))
+            lines.append(wrap_paragraphs(about, before=f"  {name:<10}  "))
+    others = f"Experimental, and may change: {', '.join(EXPERIMENTAL)}."
+    say(
+        "\n".join(
+            [*lines, "", wrap_paragraphs(others), "", "cprl COMMAND --help lists the flags of a command."]
+        )
+    )
 
 
 def run(
@@ -163,11 +187,14 @@ def run(
 
 
 def _is_run_by_name(words: Sequence[str]) -> bool:
-    """Run the recipe that words name, with its own flags, if they name one; refuse what is nothing at all."""
+    """Run the recipe whose name comes first, and return whether there is one.
+
+    Words that name neither a recipe nor a file or directory are refused.
+    """
     if not words or words[0].startswith("-"):
         return False
     name = words[0]
-    with in_a_sentence(f"{PROGRAM}{name}"):
+    with exit_with_message(f"{PROGRAM}{name}"):
         if not is_shipped(name):
             _refuse_unknown(Path(name))
             return False
@@ -179,9 +206,9 @@ def _is_run_by_name(words: Sequence[str]) -> bool:
 
 
 def _refuse_unknown(path: Path) -> None:
-    """Refuse what is no file or directory and so was meant as the name of a recipe, and a Python file."""
+    """Refuse a path that does not exist, which may be a mistyped name of a recipe, and a Python file."""
     if path.suffix == ".py" and path.is_file():
-        line = printed(["python", str(path)])
+        line = quote_command(["python", str(path)])
         raise ValueError(f"{path} is a recipe of your own, which Python runs: {line}")
     if path.exists():
         return
@@ -189,8 +216,9 @@ def _refuse_unknown(path: Path) -> None:
     if name in shipped_recipes():
         raise ValueError(f"the name of a recipe stands first, its flags behind it: {PROGRAM}{name} [FLAGS]")
     raise ValueError(
-        f"{name!r} is no file, no directory of a run and no recipe of cprl{meant(name, shipped_recipes())}; "
-        "allowed: those that are there, and the recipes that cprl recipe lists"
+        f"{name!r} is no file, no directory of a run and no recipe of cprl"
+        f"{did_you_mean(name, shipped_recipes())}; allowed: those that are there, and the recipes that "
+        "cprl recipe lists"
     )
 
 
@@ -201,13 +229,13 @@ def recipe(name: str | None = None, /) -> None:
         name: The recipe that is printed.
     """
     if name is not None:
-        OUT.write(recipe_named(name).text())
+        OUT.write(recipe_named(name).portable_source())
         OUT.flush()
         return
-    recipes = [recipe for recipe in shipped_recipes().values() if recipe.runs]
+    recipes = [recipe for recipe in shipped_recipes().values() if recipe.is_runnable]
     width = max(len(recipe.name) for recipe in recipes)
     for recipe in recipes:
-        say(f"{recipe.name:<{width}}  {recipe.about}")
+        say(f"{recipe.name:<{width}}  {recipe.summary}")
 
 
 def watch(run: Path, /, *, serve: bool = False) -> None:
@@ -219,13 +247,16 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
     """
     if run.is_file() and run.suffix != ".rrd":
         raise ValueError(f"{run} is no recording; allowed: a run's directory, or a file that ends in .rrd")
-    from cprl.viewer.page import FILE_NAME, has_display, recordings_of, to_watch
+    from cprl.viewer.page import RECORDING_FILE, has_display, recordings_of, to_watch
 
     files = [run] if run.is_file() else recordings_of(run)
     if not files:
-        raise ValueError(f"{run} holds no recording ({FILE_NAME}); recipes write one unless watch is off")
+        raise ValueError(
+            f"{run} holds no recording ({RECORDING_FILE}); recipes write one unless watch is off"
+        )
     if serve or not has_display():
-        _serve(files, why="" if serve else "There is no display: ")
+        why = "" if serve else "There is no display: "
+        _serve(files, why=why)
         return
     command = to_watch(*files)
     if sys.platform == "win32":  # where execvp ends this process at once, and quotes nothing
@@ -234,6 +265,7 @@ def watch(run: Path, /, *, serve: bool = False) -> None:
 
 
 def _serve(files: Sequence[Path], *, why: str) -> None:
+    """Serve recordings for browsers until Ctrl-C."""
     from cprl.viewer.live import served
 
     with suppress(KeyboardInterrupt), served(files) as page:
@@ -283,6 +315,4 @@ def export(
         return
     if not weights:
         raise ValueError(f"--no-weights is of results; allowed: without --format {format}")
-    from cprl.evaluation.export import export_episodes
-
-    export_episodes(run, out, format=format, episodes=episodes, replica=replica, seed=seed)
+    experimental("export_turns")(run, out, format=format, episodes=episodes, replica=replica, seed=seed)

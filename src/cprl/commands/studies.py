@@ -1,4 +1,4 @@
-"""`cprl sweep` and `search`, and `study_main`: the command line of a recipe of a study."""
+"""The command lines of studies: `cprl sweep`, and `study_main` for recipes that describe a study."""
 
 import importlib.util
 import os
@@ -8,30 +8,31 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol, TypeVar
 
 import tyro
 
 from cprl.commands.flags import with_help
-from cprl.commands.recipe import (
+from cprl.commands.recipe_command import (
     ALLOW,
     Words,
     ended_by_sigterm,
-    in_a_sentence,
+    exit_with_message,
     parse_with,
     trust_allowed,
-    wrapped,
+    wrap_paragraphs,
 )
 from cprl.runs.length import UNITS, without_length
 from cprl.runs.recipe import read_recipe, without_directories, without_options
-from cprl.system.defaults import LAST
-from cprl.system.output import console, printed, say
-from cprl.system.shipped import command_of, is_shipped, named_command, program_of, recipe_named
+from cprl.system.defaults import LAST_EPISODES
+from cprl.system.output import console, quote_command, say
+from cprl.system.shipped import command_line, is_shipped, program_name, recipe_named, typed_command_line
+from cprl.system.waiting_room import experimental
 from cprl.values import Range, checked
 
 if TYPE_CHECKING:
     from cprl.experiment import Experiment
-    from cprl.studies import SearchResult, Study, StudyResult
+    from cprl.studies import Study, StudyResult
     from cprl.studies.executors import Executor
 
 _RECIPE: Final = (
@@ -47,15 +48,12 @@ _NOTE: Final = (
     "uniform(LOW,HIGH), loguniform(LOW,HIGH) or integers(LOW,HIGH). Every other flag below is the same in "
     "all conditions; --replicas is the number in each condition."
 )
-_ABOUT: Final = {
-    "cprl sweep": "Run a recipe under several conditions.",
-    "cprl search": "Search for good values of a recipe's experiment by Optuna, point by point.",
-}
+_ABOUT: Final = "Run a recipe under several conditions."
 
 
 @dataclass(frozen=True, kw_only=True)
 class TrialOptions:
-    """How trials are run and compared; nothing of it changes a run."""
+    """Options of how trials are run and compared. None of them changes a run."""
 
     out: Path | None = None
     """The study's directory; by default studies/NAME. The same line continues a study that was stopped, and
@@ -65,14 +63,14 @@ class TrialOptions:
     jobs: int | None = None
     """Trials that run at the same time."""
     on: Literal["here", "processes", "ray"] | None = None
-    """Where trials are run: one after the other in this process, in processes on this machine, or by Ray
-    (extra "ray"); by default here, and in processes with more than one of --jobs."""
+    """The place where trials are run: one after the other in this process, in processes on this machine, or
+    by Ray (extra "ray"); by default here, and in processes with more than one of --jobs."""
     address: str | None = None
-    """Of a Ray cluster: "auto", or HOST:PORT; with --on ray."""
+    """The address of a Ray cluster: "auto", or HOST:PORT; with --on ray."""
     figures: bool = True
     """Write the table, summary and figures at the end."""
-    last: int = LAST
-    """Episodes at the end of the training that these compare; of long trainings rather 500."""
+    last: int = LAST_EPISODES
+    """The number of episodes at the end of the training that results compare; 500 suits long trainings."""
     dry_run: bool = False
     """List all conditions, trials and their states; run and write nothing."""
     block: int | None = None
@@ -81,7 +79,7 @@ class TrialOptions:
 
 @dataclass(frozen=True, kw_only=True)
 class StudyOptions(TrialOptions):
-    """How a study is run."""
+    """Options of how a study is run."""
 
     only: Words = ()
     """Run a condition alone, or those with some levels: "gamma=0.9", "gamma=0.9, freeze_steps=5"; may be
@@ -93,80 +91,71 @@ class StudyOptions(TrialOptions):
 
 @dataclass(frozen=True, kw_only=True)
 class MainOptions(StudyOptions):
-    """How the study of a recipe is run."""
+    """Options of a recipe that describes a study."""
 
     episodes: int | None = None
-    """Of each condition; by default as many as the study says."""
+    """Episodes of each condition; by default as many as the study says."""
     steps: int | None = None
-    """Of each condition of a study that counts steps; by default as many as the study says."""
+    """Steps of each condition of a study that counts steps; by default as many as the study says."""
     replicas: int | None = None
-    """Of each condition; by default as many as the study says."""
+    """Replicas of each condition; by default as many as the study says."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SweepOptions(StudyOptions):
-    """What is varied, and how it is run."""
+    """Options of `cprl sweep`: what is varied, and how it is run."""
 
     vary: Words = ()
     """PATH=VALUE,VALUE,... e.g. game.rules.freeze-steps=5,25,100; repeated, every combination is run."""
     draws: int | None = None
-    """So many random combinations instead of all."""
+    """The number of random combinations that are run instead of all combinations."""
     design: Literal["random", "latin_hypercube", "sobol"] = "random"
-    """With --draws: how they are drawn, by chance or evenly."""
+    """The way to draw combinations, with --draws: independently, or evenly over all ranges."""
     reference: str | None = None
     """The name of the condition that others are compared with, e.g. "freeze_steps=25"."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SearchOptions(TrialOptions):
-    """What is searched, and how it is run."""
-
-    vary: Words = ()
-    """PATH=VALUE,VALUE,... or PATH=loguniform(LOW,HIGH); may be repeated."""
-    points: int = 30
-    """How many points Optuna (extra "optuna") proposes."""
-    metric: str = "collective_return"
-    """The metric whose best value is searched."""
-    direction: Literal["maximise", "minimise"] = "maximise"
-    """Whether it should be high or low."""
-    over: Literal["evaluation", "training"] = "evaluation"
-    """Which episodes count: the evaluation, or the last 30 of the training."""
-    sampler: Literal["tpe", "random", "gp"] = "tpe"
-    """How points are proposed."""
-    at_once: int = 4
-    """Points that are proposed together; a multiple of --jobs keeps all of them busy."""
+ResultT = TypeVar("ResultT")
 
 
-T = TypeVar("T")
-RecipeOptions = TypeVar("RecipeOptions", SweepOptions, SearchOptions)
+class _VariedOptions(Protocol):
+    """Options that say what is varied: PATH=VALUES each."""
+
+    @property
+    def vary(self) -> tuple[str, ...]: ...
+
+
+VariedOptionsT = TypeVar("VariedOptionsT", bound=_VariedOptions)
 
 
 def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
-    """Run a study as the command line asks for it; a recipe of a study ends with it.
+    """Run a study with the options of a command line. A recipe that describes a study ends with this call.
 
     Args:
-        argv: the command line, script first; by default this process's.
+        study: the study to run.
+        argv: the command line, beginning with the script; by default that of this process.
 
     Returns:
         The study's directory.
 
     Raises:
-        SystemExit: where the command line is refused, with the reason; with code 1 where trials failed, and
-            130 or 143 where SIGINT (Ctrl-C) or SIGTERM interrupted it.
+        SystemExit: if the command line is refused, with the reason; with code 1 if trials failed, and with
+            130 or 143 if SIGINT (Ctrl-C) or SIGTERM interrupted the study.
     """
     command = list(sys.argv if argv is None else argv)
-    script = program_of(command[0])
-    with in_a_sentence(script):
+    script = program_name(command[0])
+    with exit_with_message(script):
         words = trust_allowed(command[1:])
         options = tyro.cli(MainOptions, args=words, prog=script, description=_about(study), config=_CONFIG)
-        changes = _given(options)
-        said = {unit: changes.pop(unit) for unit in UNITS if unit in changes}
-        if said:
-            changes["experiment"] = replace(study.experiment, **without_length({}) | said)
+        changes = study_fields(options)
+        length = {unit: changes.pop(unit) for unit in UNITS if unit in changes}
+        if length:
+            changes["experiment"] = replace(study.experiment, **without_length({}) | length)
         study = replace(study, **changes)
-        for unit, number in said.items():
+        for unit, number in length.items():
             for condition in study.all_conditions:
-                if (stated := getattr(condition.experiment, unit)) != number:
+                stated = getattr(condition.experiment, unit)
+                if stated != number:
                     raise ValueError(
                         f"--{unit} is {number}, and the study's condition {condition.name} says {stated}; "
                         f"allowed: --{unit} where no condition says how many"
@@ -174,8 +163,11 @@ def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
         return carry_out(study, options, command)
 
 
-def _given(options: TrialOptions) -> dict[str, Any]:
-    """The options that are fields of a `Study` or `Search`: those that the class of these has itself."""
+def study_fields(options: TrialOptions) -> dict[str, Any]:
+    """Return the options that are fields of a `Study` or a search, without those that are not given.
+
+    These are the fields that the class of the options defines itself; inherited ones say how trials are run.
+    """
     names = {"block", *type(options).__annotations__} - {"vary"}
     return {name: value for name, value in vars(options).items() if name in names and value is not None}
 
@@ -184,48 +176,32 @@ def sweep(words: Sequence[str], /) -> None:
     """Run a recipe under several conditions: cprl sweep RECIPE --vary ...
 
     Args:
-        words: what stands after `cprl sweep`: first a Python file with a function `experiment`, the name of
-            a recipe that comes with cprl, a recipe.json, or the directory of a run; then options.
+        words: the words after `cprl sweep`. The first is a Python file with a function `experiment`, the name
+            of a recipe that comes with cprl, a recipe.json, or the directory of a run. Options follow.
     """
-    experiment, options = _read(words, SweepOptions(), "cprl sweep")
+    experiment, options = read_recipe_and_options(words, SweepOptions(), "cprl sweep", about=_ABOUT)
 
     from cprl.studies import Study
     from cprl.studies.factors import factors_of
 
-    study = Study(experiment, factors_of(experiment, options.vary), **_given(options))
+    study = Study(experiment, factors_of(experiment, options.vary), **study_fields(options))
     carry_out(study, options, ["cprl", "sweep", *words])
 
 
-def search(words: Sequence[str], /) -> None:
-    """Search for good values by Optuna: cprl search RECIPE --vary ... --points 30
+def read_recipe_and_options(
+    words: Sequence[str], options: VariedOptionsT, program: str, *, about: str
+) -> "tuple[Experiment, VariedOptionsT]":
+    """Parse a recipe and the options after it; print the help if it is asked for.
 
     Args:
-        words: what stands after `cprl search`, see `sweep`.
+        words: the words after the command.
+        options: the default options.
+        program: the command, e.g. "cprl sweep".
+        about: the first sentence of the help.
     """
-    experiment, options = _read(words, SearchOptions(), "cprl search")
-
-    from cprl.studies import Search, run_search
-    from cprl.studies.factors import factors_of
-    from cprl.studies.study import directory_of
-
-    wanted = Search(experiment, factors_of(experiment, options.vary), **_given(options))
-    command = ["cprl", "search", *words]
-    executor = executor_of(options)
-    if options.dry_run:
-        factors = ", ".join(f"{name}: {factor}" for name, factor in wanted.factors.items())
-        out = directory_of(wanted.study_of([]), options.out)
-        say(f"{wanted.points} points of {factors}, found one after the other, in {out}; nothing was written")
-        return
-    result = _run(partial(run_search, wanted), options, executor, command)
-    _say_best(result)
-    _say_result(result, command)
-
-
-def _read(words: Sequence[str], options: RecipeOptions, program: str) -> "tuple[Experiment, RecipeOptions]":
-    """The experiment of a recipe and the options that stand after it; prints the help that they ask for."""
     words = trust_allowed(words)
     if not words or words[0] in ("-h", "--help"):
-        _print_help(options, program)
+        _print_help(options, program, about)
     if words[0].startswith("-"):
         raise ValueError(
             f"the first word after {program} is {words[0]}; allowed: a recipe, e.g. {program} "
@@ -233,7 +209,7 @@ def _read(words: Sequence[str], options: RecipeOptions, program: str) -> "tuple[
         )
     source = recipe_named(words[0]).path if is_shipped(words[0]) else Path(words[0])
     sys.path[:0] = [str(source.resolve().parent)] if source.suffix == ".py" and source.is_file() else []
-    note = f"{_ABOUT[program]} {_NOTE}"
+    note = f"{about} {_NOTE}"
     experiment, options = parse_with(
         recipe_of(source), words[1:], options, program=f"{program} {words[0]}", note=note
     )
@@ -242,29 +218,34 @@ def _read(words: Sequence[str], options: RecipeOptions, program: str) -> "tuple[
     return experiment, options
 
 
-def _print_help(options: RecipeOptions, program: str) -> None:
+def _print_help(options: _VariedOptions, program: str, about: str) -> None:
+    """Print the help of a command that varies a recipe, and end the process."""
     kind: Any = type(options)
 
     def read(
         recipe: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(help=_RECIPE)],
         options: Annotated[kind, tyro.conf.arg(name="")] = options,
     ) -> None:
-        """Never called."""
+        """Never called: tyro reads the flags from its annotations."""
 
     listed = f"The flags of a recipe are listed by {program} RECIPE --help."
-    about = "\n\n".join([_ABOUT[program], _NOTE, listed, ALLOW])
+    text = "\n\n".join([about, _NOTE, listed, ALLOW])
     tyro.cli(
         with_help(read),
         args=["--help"],
         prog=program,
-        description=wrapped(about),
+        description=wrap_paragraphs(text),
         config=(*_CONFIG, tyro.conf.DisallowNone),
     )
 
 
 def recipe_of(source: Path) -> "Callable[..., Experiment]":
-    """What makes the experiment of a recipe: a Python file with a function `experiment`, which is imported
-    and not run; a recipe.json; or the directory of a run."""
+    """Return the function that makes the experiment of a recipe.
+
+    Args:
+        source: a Python file with a function `experiment`, which is imported; a recipe.json; or the directory
+            of a run.
+    """
     if source.suffix != ".py" or source.is_dir():
         directory = source if source.is_dir() else source.parent
         content = read_recipe(source)
@@ -284,16 +265,17 @@ def recipe_of(source: Path) -> "Callable[..., Experiment]":
     module = importlib.util.module_from_spec(spec)
     sys.modules[_MODULE] = module  # tyro reads its types
     spec.loader.exec_module(module)
-    made: Callable[..., Experiment] | None = getattr(module, "experiment", None)
-    if not callable(made):
+    make_experiment: Callable[..., Experiment] | None = getattr(module, "experiment", None)
+    if not callable(make_experiment):
         if hasattr(module, "STUDY"):
-            line = printed(["python", str(source)])
+            line = quote_command(["python", str(source)])
             raise ValueError(f"{source} describes a study, which is run by itself: {line}")
         raise ValueError(f"{source} has no function `experiment`; allowed: one that gives an Experiment")
-    return made
+    return make_experiment
 
 
 def _about(study: "Study") -> str:
+    """Return the text about a study in its `--help`."""
     conditions = study.all_conditions
     names = ", ".join(condition.name for condition in conditions[:_LISTED])
     more = f" and {len(conditions) - _LISTED} more" if conditions[_LISTED:] else ""
@@ -307,14 +289,13 @@ def _about(study: "Study") -> str:
 
 
 _LISTED: Final = 20
-"""Conditions that `--help` of a study names."""
-_BEST: Final = 10
-"""Points of a search that are printed."""
+"""The largest number of conditions that the `--help` of a study names."""
 _CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
 
 
 def executor_of(options: TrialOptions) -> "Executor":
-    from cprl.studies.executors import InProcess, Processes, Ray
+    """Return the executor for the options --on, --jobs and --address."""
+    from cprl.studies.executors import InProcess, Processes
 
     jobs = 1 if options.jobs is None else checked("--jobs", options.jobs, Annotated[int, Range(1, 4096)])
     on = options.on or ("processes" if jobs > 1 else "here")
@@ -323,86 +304,82 @@ def executor_of(options: TrialOptions) -> "Executor":
     if on == "here" and jobs > 1:
         raise ValueError(f"--jobs is {jobs} with --on here; allowed: 1, or --on processes")
     if on == "ray":
-        return Ray(options.address, jobs=options.jobs)
+        ray: Executor = experimental("Ray")(options.address, jobs=options.jobs)
+        return ray
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return InProcess() if on == "here" else Processes(options.jobs or cores)
 
 
 def carry_out(study: "Study", options: StudyOptions, command: Sequence[str]) -> Path:
-    """Run a study as the command line, script first, asks for it, print its results, and return its
-    directory."""
+    """Run a study, or list its trials with --dry-run; print the results and return the study's directory.
+
+    Args:
+        command: the command line, beginning with the script, for the messages that say how to continue.
+    """
     from cprl.studies import run_study
 
     executor = executor_of(options)
     if options.dry_run:
         return _list(study, options)
     run = partial(run_study, study, only=options.only or None, keep_checkpoints=options.keep_checkpoints)
-    result = _run(run, options, executor, command)
-    _say_result(result, command)
+    result = run_resumable(run, options, executor, command)
+    say_result(result, command)
     return result.out
 
 
-def _run(run: "Callable[..., T]", options: TrialOptions, executor: "Executor", command: Sequence[str]) -> T:
-    """Run a study or a search; note what continues it where Ctrl-C (SIGINT) or SIGTERM ends it."""
-    program, *words = named_command(command)
+def run_resumable(
+    run: "Callable[..., ResultT]", options: TrialOptions, executor: "Executor", command: Sequence[str]
+) -> ResultT:
+    """Run a study or a search. If Ctrl-C (SIGINT) or SIGTERM ends it, note the command that continues it."""
+    program, *words = command_line(command)
     # The line that runs what is lacking, whole and as a summary has it, which names no place.
-    again = printed([without_directories(program), *without_options(words, ["--only"])])
-    out = options.out
-    runs = options.runs
-    results = options.figures
-    last = options.last
+    again = quote_command([without_directories(program), *without_options(words, ["--only"])])
+    where = {"out": options.out, "runs": options.runs}
     try:
         with ended_by_sigterm():
-            return run(out, on=executor, runs=runs, results=results, last=last, again=again)
+            return run(**where, on=executor, results=options.figures, last=options.last, again=again)
     except (KeyboardInterrupt, SystemExit) as error:
-        error.add_note(f"To continue: {printed(command_of(command))}")
+        error.add_note(f"To continue: {quote_command(typed_command_line(command))}")
         raise
 
 
 def _list(study: "Study", options: StudyOptions) -> Path:
-    from cprl.studies.progress import Overview, table_of
+    """Print every trial and its state, write nothing, and return the study's directory."""
     from cprl.studies.run import trials_with
     from cprl.studies.status import BEAT_S
     from cprl.studies.study import RUNS, STATUS, directory_of
+    from cprl.studies.trial_progress import Overview, progress_table
     from cprl.studies.trials import trials_of
 
     out = directory_of(study, options.out)
     runs = out / RUNS if options.runs is None else options.runs
-    overview = Overview(trials_with(trials_of(study, runs), options.only or None), runs, out / STATUS)
+    overview = Overview(trials_with(trials_of(study, runs), options.only or None), out / STATUS)
     now = overview.look()
     if now.counts["unfinished"]:  # those that run say something new within a second
         time.sleep(1.5 * BEAT_S)
         now = overview.look()
-    console(width=None if sys.stdout.isatty() else 160).print(table_of(now, title=study.name))
+    width = None if sys.stdout.isatty() else 160
+    console(width=width).print(progress_table(now, title=study.name))
     about = f"{len(study.all_conditions)} conditions ({', '.join(study.columns)}), {study.replicas} replicas"
     say(f"{about} each, in {runs}; nothing was written")
     return out
 
 
-def _say_best(result: "SearchResult") -> None:
-    wanted = result.search
-    best = "highest" if wanted.direction == "maximise" else "lowest"
-    say(f"{wanted.name}: {len(result.points)} points; the {best} {wanted.metric}, means over replicas:")
-    for point in result.ranked[:_BEST]:
-        say(f"  {point.value:10.6g}  {point.name}")
-    refused = [point for point in result.points if point.reason]
-    if refused:
-        say(f"  {len(refused)} points were refused, e.g. {refused[0].name}: {refused[0].reason}")
+def say_result(result: "StudyResult", command: Sequence[str]) -> None:
+    """Print the results of a study and where they are. Exit with code 1 if a trial failed or is damaged.
 
-
-def _say_result(result: "StudyResult", command: Sequence[str]) -> None:
-    """Prints the results of a study, and where they are; of trials that failed or are damaged why, where to
-    look and what to do, and exits."""
+    For such a trial, the message says why, where to look, and what to do.
+    """
     from cprl.studies.results import FIGURES
-    from cprl.studies.tables.comparing import cells, of_finished
-    from cprl.terminal.tables import show
+    from cprl.studies.tables.comparing import condition_table, without_unfinished
+    from cprl.terminal.text_tables import print_tables
 
     if result.table is not None and result.table.metrics:
-        show([of_finished(cells(result.table))])
+        print_tables([without_unfinished(condition_table(result.table))])
         for figure in sorted((result.out / FIGURES).glob("*.png")):
             say(f"Figure: {figure}")
     say(result.out)
-    damaged = [run for run in result.table.lacking if run.is_damaged] if result.table is not None else []
+    damaged = [run for run in result.table.missing_runs if run.is_damaged] if result.table is not None else []
     if damaged:
         numbers = f"{len(damaged)} of {len(result.trials)} trials"
         lines = [f"{numbers} cannot be read and are not in these results, in {result.runs}:"]
@@ -414,6 +391,7 @@ def _say_result(result: "StudyResult", command: Sequence[str]) -> None:
 
 
 def _say_failed(result: "StudyResult", command: Sequence[str]) -> None:
+    """Print the trials that failed, with reasons, files to look at, and the command that tries again."""
     from cprl.studies.status import Status
     from cprl.studies.study import STATUS
 
@@ -425,4 +403,4 @@ def _say_failed(result: "StudyResult", command: Sequence[str]) -> None:
         status = Status(result.out / STATUS, name)
         where = status.failed if status.failed.exists() else status.log
         lines += [f"  {labels[name]}: {outcome.reason}", f"    {where}", f"    {outcome.command}"]
-    say("\n".join([*lines, f"To try them again: {printed(command_of(command))}"]))
+    say("\n".join([*lines, f"To try them again: {quote_command(typed_command_line(command))}"]))

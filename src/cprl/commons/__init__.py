@@ -1,35 +1,50 @@
-"""The game, in numpy and Numba. It knows nothing of torch or of learning.
+"""The game itself, in numpy and Numba, without torch and without any learning.
 
-In reading order:
+The rules of a turn are plain Python functions, each about one world. Numba compiles them for CPU threads or a
+GPU, where a loop calls them for each of B worlds.
 
-    rules        every number of the game, with unit, range and source
-    maps         boards: drawn, named or generated
+Letters, here and in shapes of arrays: B worlds, N agents, K sites (cells where apples grow), H x W cells of
+the board, and C channels of an observation of X rows and Y columns. In the rules, i and j are agents and k is
+a site.
+
+Modules in reading order. How a game is described:
+
+    rules        Rules: every number of the game, with unit, range and source
+    maps         Map: boards that are drawn, known by name, or generated
     published    the published games by name: boards with their rules
     literature   the games of other programs and papers by name
-    spaces       what agents of a game observe and may do, in numbers
-    observation  what agents observe, and in which form
-    game         Game: a map, its rules and its observations; the memory that worlds of it take
+    spaces       Spaces: the shapes of observations and the number of actions
+    observation  Observation: the form in which agents observe the game
+    game         Game: a map, its rules, its observations and its institutions
     cells        the classes of cells, and the colours in which agents observe them
     headings     the four headings, and the step to the cell ahead
-    near         which sites are near each other
-    yields       what a map can bear: a proven lower bound
-    tables       a game as lookup tables for the compiled rules
+    near         finds the sites that are near each other
+    yields       the sustainable yield of a map: a proven lower bound
+
+The rules, each on one world, and the arrays that they work on:
+
+    tables       Tables: a game as lookup tables for the compiled rules
     chance       counter-based random numbers
-    world        the arrays of B worlds: state, step output, scratch memory
-    moves        walking, clashes, and how agents return to play, on one world
-    quirks       a group of rules: what only the program of 2019 does
-    beam         beams, hits and tags, on one world
-    river        a group of rules: waste in a river, and how it is cleaned
-    actions      what an agent does with its action, on one world
-    apples       harvest and regrowth, on one world
-    views        the picture of the board and the agents' windows, on one world
-    turn         the order of a turn and of an episode, on one world
+    world        the arrays of B worlds: state, output of a step, working memory
+    moves        walking, clashes, and the return of tagged agents
+    quirks       Quirks2019: rules in which the program of 2019 differs from its paper
+    beam         beams, hits and tags
+    river        River: rules about waste in a river and its cleaning
+    actions      an agent's action: walk, turn, fire, clean, signal
+    apples       harvest and regrowth
+    views        the picture of the board and the observations of agents
+    turn         the order of events in a turn and in an episode
     loops        the loops over worlds that a thread runs
-    records      records of arrays, as compiled code hands them on
-    linking      rules as parts of one piece of machine code
-    compiled     compiles the rules for a target, or runs them as plain Python
+
+How the rules are compiled and run:
+
+    records      named tuples of arrays, passed by reference in compiled code
+    linking      joins all rules to one piece of machine code
+    code_key     a hash of all code that a function can reach
+    disk_cache   keeps compiled functions on disk, for all processes
+    compiled     compiles the rules, or runs them as plain Python
     threads      CpuThreads: runs the loops on CPU threads
     cuda         CudaThreads: runs the loops on a GPU
-    state        reads, checks and restores the state of B worlds
+    state        checks a saved state before it is restored
     batch        Batch: B worlds, played a turn at a time
 """

@@ -1,4 +1,4 @@
-"""What an agent does with its action: walk, turn, fire, clean, signal, on one world."""
+"""Apply the actions of agents: walk, turn, fire, clean, signal. The rules work on one world."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from cprl.commons.moves import (
     WALK_TURN,
     draw_order,
     go_back,
-    shares_a_cell,
+    has_company,
     walk,
     without_signal,
 )
 from cprl.commons.river import aim_to_clean, is_cleaning
-from cprl.values.arrays import Int64
+from cprl.values.array_types import Int64
 
 if TYPE_CHECKING:
     from cprl.commons.tables import Tables
@@ -27,18 +27,19 @@ if TYPE_CHECKING:
 
 
 def act(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch: Scratch) -> None:
-    """Let each agent in play turn, fire or move; clashing moves are cancelled later, under "in_turn" at once.
-    `actions`: int64 [N].
+    """Apply each agent's action to its position, heading and beam; `actions`: int64 [N].
 
-    No agent moves onto a wall or off the board. An agent that may not fire does not, and has to wait as if it
-    had.
+    Under the clash rule "in_turn" agents act one after another, in an order drawn by chance, and a clashing
+    move is undone immediately. Under the other rules `settle_clashes` undoes clashing moves afterwards. No
+    agent moves onto a wall or off the board. An agent that an institution forbids to fire still starts its
+    cooldown.
     """
     if tables.clashes == IN_TURN:
         draw_order(world, scratch)
-    for n in range(world.row.shape[0]):
-        i = scratch.order[n] if tables.clashes == IN_TURN else n
+    for turn_place in range(world.row.shape[0]):
+        i = scratch.order[turn_place] if tables.clashes == IN_TURN else turn_place
         act_one(world, tables, actions, scratch, i)
-        if tables.clashes == IN_TURN and world.in_play[i] and shares_a_cell(world, i):
+        if tables.clashes == IN_TURN and world.in_play[i] and has_company(world, i):
             go_back(world, scratch, i)
     for i in range(world.row.shape[0]):
         if law is not None:
@@ -48,7 +49,7 @@ def act(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch:
 
 
 def act_one(world: Worlds, tables: Tables, actions: Int64, scratch: Scratch, i: int) -> None:
-    """Let agent i act, if it is in play."""
+    """Apply the action of agent i if it is in play, and note where it begins the turn."""
     scratch.start_row[i] = world.row[i]
     scratch.start_col[i] = world.col[i]
     world.fired[i] = False
@@ -58,16 +59,16 @@ def act_one(world: Worlds, tables: Tables, actions: Int64, scratch: Scratch, i: 
     aim_to_clean(world.groups.river, i, world.in_play[i], action)
     if not world.in_play[i]:
         return
-    is_hot = tables.cooldown_steps > 0 and world.cooldown[i] > 0
-    if is_hot:
+    in_cooldown = tables.cooldown_steps > 0 and world.cooldown[i] > 0
+    if in_cooldown:
         world.cooldown[i] -= 1
-    if action < TURN_LEFT:
+    if action < TURN_LEFT:  # actions 0 to 3 walk, in the order of `WALK_TURN`
         walk(world, tables, i, (world.heading[i] + WALK_TURN[action]) % 4)
     elif action == TURN_LEFT:
-        world.heading[i] = (world.heading[i] + 3) % 4
+        world.heading[i] = (world.heading[i] + 3) % 4  # three turns to the right
     elif action == TURN_RIGHT:
         world.heading[i] = (world.heading[i] + 1) % 4
-    elif action == FIRE and tables.has_beam and not is_hot:
+    elif action == FIRE and tables.has_beam and not in_cooldown:
         world.fired[i] = True
         if tables.cooldown_steps > 0:
             world.cooldown[i] = tables.cooldown_steps

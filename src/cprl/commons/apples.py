@@ -1,4 +1,4 @@
-"""Apples: harvest and random regrowth, on one world."""
+"""Apples: how they are harvested and grow back by chance. The rules work on one world."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from cprl.commons.chance import (
 from cprl.commons.moves import cell_of, without_signal
 from cprl.commons.quirks import keep_old_stock
 from cprl.commons.river import pollute, slowed
-from cprl.institutions.hooks import note_apple, note_bite, note_step, stops_bite
-from cprl.values.arrays import Float32, Int64
+from cprl.institutions.hooks import note_apple, note_harvest, note_step, stops_harvest
+from cprl.values.array_types import Float32, Int64
 
 if TYPE_CHECKING:
     from cprl.commons.tables import Tables
@@ -29,11 +29,11 @@ if TYPE_CHECKING:
     from cprl.institutions import Law
 
 FROM_START, BEFORE_BITES, AFTER_BITES = range(3)
-"""`Rules.growth`, in the order of its words."""
+"""The values of `Tables.growth`, in the order of the words that `Rules.growth` allows."""
 
 
 def fill(world: Worlds, tables: Tables) -> None:
-    """Put an apple on every site, or under `first_stock_share` on a number of them drawn by chance."""
+    """Begin an episode with an apple on every site, or on `first_stock` sites drawn by chance."""
     sites = world.stock.shape[0]
     for k in range(sites):
         world.stock[k] = 1
@@ -45,19 +45,23 @@ def fill(world: Worlds, tables: Tables) -> None:
 
 
 def draw_first_stock(world: Worlds, tables: Tables) -> None:
-    """Leave apples on `first_stock` sites, all sets of that size equally likely: site by site, as many as
-    are still wanted in so many sites (Knuth, The Art of Computer Programming, 3.4.2, algorithm S)."""
-    wanted, sites = tables.first_stock, world.stock.shape[0]
+    """Put apples on `first_stock` sites, where every set of that size is equally likely.
+
+    The sites are visited in order. Each gets an apple with the probability m / s, where m apples are still
+    missing and s sites are left to visit (Knuth, The Art of Computer Programming, 3.4.2, algorithm S).
+    """
+    missing = tables.first_stock
+    sites = world.stock.shape[0]
     for k in range(sites):
         word = np.int64(draw(world, FIRST_STOCK | k)[0])
-        is_kept = word * (sites - k) < wanted << WORD_SIZE
-        world.stock[k] = is_kept
-        wanted -= is_kept
+        has_apple = word * (sites - k) < missing << WORD_SIZE
+        world.stock[k] = has_apple
+        missing -= has_apple
     recount(world, tables)
 
 
 def add_apple(world: Worlds, tables: Tables, law: Law | None, k: int) -> None:
-    """Let an apple appear on site k, whatever brings it, and tell all that counts apples."""
+    """Put an apple on site k, and update every count of apples."""
     world.stock[k] = 1
     world.stock_left[0] += 1
     for n in range(tables.near_first[k], tables.near_first[k + 1]):
@@ -67,7 +71,7 @@ def add_apple(world: Worlds, tables: Tables, law: Law | None, k: int) -> None:
 
 
 def remove_apple(world: Worlds, tables: Tables, law: Law | None, k: int) -> None:
-    """Let the apple on site k vanish, whatever takes it, and tell all that counts apples."""
+    """Take the apple from site k, and update every count of apples."""
     world.stock[k] = 0
     world.stock_left[0] -= 1
     for n in range(tables.near_first[k], tables.near_first[k + 1]):
@@ -77,7 +81,7 @@ def remove_apple(world: Worlds, tables: Tables, law: Law | None, k: int) -> None
 
 
 def recount(world: Worlds, tables: Tables) -> None:
-    """Recompute what follows from the stock: the apples left, and the apples near each site."""
+    """Count the apples on the board, and the apples near each site, from the stock alone."""
     world.stock_left[0] = 0
     for k in range(world.stock.shape[0]):
         world.near[k] = 0
@@ -89,21 +93,21 @@ def recount(world: Worlds, tables: Tables) -> None:
 def draw_first_bytes(world: Worlds, scratch: Scratch) -> None:
     """Draw the first byte of every site's random word into `scratch.words`, four sites per word."""
     sites = world.stock.shape[0]
-    for number in range((sites + SITES_PER_DRAW - 1) // SITES_PER_DRAW):
-        words = draw(world, REGROWTH_FIRST_BYTE + number)
-        scratch.words[4 * number] = words[0]
-        scratch.words[4 * number + 1] = words[1]
-        scratch.words[4 * number + 2] = words[2]
-        scratch.words[4 * number + 3] = words[3]
+    for draw_index in range((sites + SITES_PER_DRAW - 1) // SITES_PER_DRAW):
+        words = draw(world, REGROWTH_FIRST_BYTE + draw_index)
+        scratch.words[4 * draw_index] = words[0]
+        scratch.words[4 * draw_index + 1] = words[1]
+        scratch.words[4 * draw_index + 2] = words[2]
+        scratch.words[4 * draw_index + 3] = words[3]
 
 
 def find_sprouts(world: Worlds, tables: Tables, scratch: Scratch) -> int:
-    """Find the sites that grow an apple in this turn, given the current stock; return their number.
+    """Write the sites that grow an apple in this turn into `scratch.sprouts`, and return their number.
 
-    An empty site grows an apple if its random 32-bit word is below a threshold that depends on the number of
-    apples near it. Sixteen sites share one draw for the first bytes of their words; the other three bytes are
-    drawn only where the first byte does not decide. The first loop has no branch, because a processor cannot
-    predict which sites are empty.
+    An empty site grows an apple if its random 32-bit word is below a threshold, which depends on the number
+    of apples near it. Sixteen sites share one draw for the first bytes of their words. The first loop keeps
+    the sites that may grow an apple by their first byte; only for these the other three bytes are drawn. It
+    has no branch, because a processor cannot predict which sites are empty.
     """
     open_sites = 0
     draw_first_bytes(world, scratch)
@@ -125,7 +129,7 @@ def find_sprouts(world: Worlds, tables: Tables, scratch: Scratch) -> int:
 
 
 def find_open_by_share(world: Worlds, tables: Tables, scratch: Scratch) -> int:
-    """As the first loop of `find_sprouts`, where each site has its own row of thresholds."""
+    """Find the sites that may grow an apple by their first byte, where each site has its own thresholds."""
     open_sites = 0
     for k in range(world.stock.shape[0]):
         first_byte = (scratch.words[k >> 2] >> (8 * (k & 3))) & LOW_BYTE
@@ -136,12 +140,12 @@ def find_open_by_share(world: Worlds, tables: Tables, scratch: Scratch) -> int:
 
 
 def has_sprouted(world: Worlds, tables: Tables, scratch: Scratch, k: int) -> bool:
-    """Return whether the whole random word of site k is below its threshold."""
+    """Return whether site k grows an apple: its whole random word is below its threshold."""
     first_byte = (scratch.words[k >> 2] >> (8 * (k & 3))) & LOW_BYTE
     rest = np.int64(draw(world, REGROWTH_REST + k)[0]) >> BYTE_BITS
     row = tables.regrow_row[k] if tables.regrow_by_share else 0
-    below = slowed(tables.regrow_below[row + world.near[k]], world.groups.river)
-    return ((first_byte << REST_BITS) | rest) < below
+    threshold = slowed(tables.regrow_below[row + world.near[k]], world.groups.river)
+    return ((first_byte << REST_BITS) | rest) < threshold
 
 
 def is_stood_on(world: Worlds, tables: Tables, k: int) -> bool:
@@ -153,35 +157,37 @@ def is_stood_on(world: Worlds, tables: Tables, k: int) -> bool:
 
 
 def grow(world: Worlds, tables: Tables, law: Law | None, scratch: Scratch, sprouts: int) -> None:
-    """Add an apple on each site that `find_sprouts` found; `sprouts`: the number of these sites."""
+    """Put an apple on each site that `find_sprouts` found; `sprouts`: the number of these sites."""
     for s in range(sprouts):
         add_apple(world, tables, law, scratch.sprouts[s])
 
 
-def bite_and_grow(
+def harvest_and_grow(
     world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch: Scratch, harvest: Float32
 ) -> int:
-    """Let agents harvest and apples grow, in the order of `Rules.growth`; return the number of apples that
-    grow."""
+    """Let agents harvest and apples grow, in the order that `Rules.growth` says.
+
+    `actions`: int64 [N]; `harvest`: float32 [N], written. Return the number of apples that grew.
+    """
     if tables.growth == AFTER_BITES:
-        bite(world, tables, law, actions, harvest)
+        harvest_apples(world, tables, law, actions, harvest)
     sprouts = find_sprouts(world, tables, scratch)
     pollute(world, world.groups.river)
     if tables.growth == BEFORE_BITES:
         grow(world, tables, law, scratch, sprouts)
     if tables.growth != AFTER_BITES:
-        bite(world, tables, law, actions, harvest)
+        harvest_apples(world, tables, law, actions, harvest)
     if tables.growth != BEFORE_BITES:
         grow(world, tables, law, scratch, sprouts)
     return sprouts
 
 
-def bite(world: Worlds, tables: Tables, law: Law | None, actions: Int64, harvest: Float32) -> None:
-    """Let each agent in play that harvests (`harvest_action`) take the apple on its cell, unless an
-    institution stops it, which notes what the agent breaks; `harvest`: float32 [N], 0 or 1.
+def harvest_apples(world: Worlds, tables: Tables, law: Law | None, actions: Int64, harvest: Float32) -> None:
+    """Let each agent in play take the apple on its cell; write 1 or 0 to `harvest`, float32 [N].
 
-    Two agents share a cell only where clashes are settled "pairwise": the lower index that may gets the
-    apple.
+    With `Rules.harvest_action` an agent must have chosen the action "harvest". Institutions may stop a
+    harvest, or note the rule that it breaks. Two agents share a cell only where clashes are settled
+    "pairwise": then the agent with the lower index comes first.
     """
     for i in range(world.row.shape[0]):
         harvest[i] = 0.0
@@ -194,22 +200,22 @@ def bite(world: Worlds, tables: Tables, law: Law | None, actions: Int64, harvest
                 k >= 0
                 and world.stock[k] == 1
                 and harvests(tables, actions[i])
-                and may_bite(law, i, cell, k, world.step[0])
+                and may_be_harvested(law, i, cell, k, world.step[0])
             ):
                 remove_apple(world, tables, law, k)
                 harvest[i] = 1.0
                 world.harvested[i] += 1
                 if law is not None:
-                    note_bite(law, i, cell, k, world.step[0])
+                    note_harvest(law, i, cell, k, world.step[0])
 
 
 def harvests(tables: Tables, action: int) -> bool:
-    """Return whether an agent that stands on an apple harvests it by its action."""
+    """Return whether an action harvests the apple on which the agent stands."""
     return tables.harvest_number < 0 or tables.harvest_number == without_signal(tables, action)
 
 
-def may_bite(law: Law | None, i: int, cell: int, k: int, step: int) -> bool:
-    """Return whether no institution stops agent i from harvesting site k."""
+def may_be_harvested(law: Law | None, i: int, cell: int, k: int, step: int) -> bool:
+    """Return whether institutions let agent i harvest site k, which lies on a cell."""
     if law is None:
         return True
-    return not stops_bite(law, i, cell, k, step)
+    return not stops_harvest(law, i, cell, k, step)

@@ -1,4 +1,4 @@
-"""Batch: B worlds of a game, played a turn at a time by a driver (CPU threads or a GPU)."""
+"""Batch: B worlds of a game, which a driver (CPU threads or a GPU) plays a turn at a time."""
 
 from collections.abc import Mapping
 from typing import Annotated, Any, Protocol
@@ -10,56 +10,60 @@ from cprl.commons import state as states
 from cprl.commons.game import Game, output_forms
 from cprl.commons.tables import Tables
 from cprl.commons.threads import CpuThreads
-from cprl.commons.world import BEGIN, PLAY, REFRESH, Shown, StepOutput, Worlds, empty_worlds
+from cprl.commons.world import BEGIN, PLAY, REFRESH, StepOutput, Worlds, WorldView, empty_worlds
 from cprl.institutions import Law
-from cprl.institutions.arrays import lasting
+from cprl.institutions.arrays import state_arrays
 from cprl.institutions.law import new_law
 from cprl.values import Range, Seed, checked
-from cprl.values.arrays import Bool, Int64, UInt8
+from cprl.values.array_types import Bool, Int64, UInt8
 
 
 class Driver(Protocol):
-    """Runs the rules on B worlds: `CpuThreads` or `cprl.commons.cuda.CudaThreads`."""
+    """The interface of what runs the rules on B worlds: `CpuThreads` or `cprl.commons.cuda.CudaThreads`."""
 
     threads: int
     tables: Tables
 
     def place(self, arrays: Any) -> Any:
-        """Copy a tuple of numpy arrays, `Worlds`, `Law` or `Tables`, to where the rules run."""
+        """Copy `Worlds`, `Law` or `Tables` from numpy arrays to the memory in which the rules run."""
 
     def empty(self, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """Return a new array with undefined entries."""
+        """Return a new array of the driver, with undefined entries."""
 
     def read(self, array: NDArray[Any]) -> NDArray[Any]:
-        """Return a copy as a numpy array."""
+        """Return a copy of an array of the driver, as a numpy array."""
 
     def write(self, array: NDArray[Any], values: NDArray[Any]) -> None:
-        """Copy values of the same shape and dtype into an array."""
+        """Copy numpy values of the same shape and dtype into an array of the driver."""
 
-    def first_unknown(self, actions: Int64, known: int) -> int:
-        """Return the index, in row-major order, of the first action outside 0 .. known - 1; -1 if there is
-        none."""
+    def first_invalid(self, actions: Int64, known: int) -> int:
+        """Return the row-major index of the first action that is not in 0 .. known - 1, or -1."""
 
     def run(self, task: int, game: tuple[Any, ...]) -> None:
-        """Do a task of `cprl.commons.loops.run_worlds`. Nothing is checked: all arrays are contiguous and
-        have the form that the game gives them.
+        """Do a task of `cprl.commons.loops.run_worlds` with the worlds.
+
+        Nothing is checked. All arrays must be contiguous and have the shapes and dtypes of the game.
 
         Args:
-            game: what `Played` says, as a plain tuple, which takes a third of the time to make.
+            task: PLAY, BEGIN or REFRESH, see `cprl.commons.world`.
+            game: the entries of `Played`, as a plain tuple, since that is made in a third of the time.
         """
 
     def show(self, game: tuple[Worlds, Tables, UInt8]) -> None:
-        """Draw boards, see `cprl.commons.loops.show_worlds`."""
+        """Draw the boards of the worlds, see `cprl.commons.loops.show_worlds`."""
 
 
 class Batch:
     """B worlds of a game, played a turn at a time.
 
     Args:
-        seed: 0 to 2**64 - 1. Random numbers are a function of the seed, the index of the world, the episode
-            and the step alone.
-        first_world: The index of the first world; with it, world b of a larger batch can be played alone.
-        threads: The number of CPU threads that share the worlds; None uses all cores where that is faster.
+        game: the game to play.
+        worlds: the number of worlds B.
+        seed: 0 to 2**64 - 1. All random numbers follow from the seed, the index of the world, the episode and
+            the step.
+        first_world: the index of the first world, with which world b of a larger batch can be played alone.
+        threads: the number of CPU threads that share the worlds; None uses all cores where that is faster.
+        driver: runs the rules; None makes `CpuThreads`.
     """
 
     def __init__(
@@ -83,26 +87,27 @@ class Batch:
         self.size = worlds
         self.driver: Driver = driver or CpuThreads(game, worlds, threads=threads)
         self.has_begun = False
-        """Whether the worlds have begun an episode, so that there is something to show."""
+        """True once all worlds have begun an episode."""
         host = empty_worlds(game, worlds)
         host.number[:, 0] = np.arange(first_world, first_world + worlds, dtype=np.uint64)
         self.now: Worlds = self.driver.place(host)
         """The current state of the worlds, in the driver's arrays."""
         self.law: Law | None = self.driver.place(new_law(game, worlds)) if game.institutions else None
-        """Likewise; None without institutions."""
-        self._nothing: Int64 = self.driver.empty((worlds, game.agents), np.int64)
-        self.driver.write(self._nothing, np.zeros((worlds, game.agents), np.int64))
+        """The state and parameters of the institutions, in the driver's arrays; None without any."""
+        self._first_choices: Int64 = self.driver.empty((worlds, game.agents), np.int64)
+        """Zeros, int64 [B, N]: the actions or decisions of a task that is given none."""
+        self.driver.write(self._first_choices, np.zeros((worlds, game.agents), np.int64))
         self._all_worlds: Bool = self.driver.empty((worlds,), np.bool_)
         self.driver.write(self._all_worlds, np.ones(worlds, np.bool_))
         self.set_seed(seed)
 
     def set_seed(self, seed: int) -> None:
-        """Restart from a seed: the next episode of each world is the first episode of this seed."""
+        """Restart from a seed, so that the next episode of each world is the first episode of that seed."""
         self.driver.write(self.now.seed, np.full((self.size, 1), checked("seed", seed, Seed), np.uint64))
         self.driver.write(self.now.episode, np.full((self.size, 1), -1, np.int32))
 
     def new_output(self) -> StepOutput:
-        """Return new arrays for the output of a turn."""
+        """Return new arrays for the output of a turn, with undefined entries."""
         forms = output_forms(self.game, self.size)
         return StepOutput(*(self.driver.empty(*form) for form in forms.values()))
 
@@ -113,78 +118,103 @@ class Batch:
         *,
         actions: Int64 | None = None,
         decisions: Int64 | None = None,
-        which: Bool | None = None,
+        selected: Bool | None = None,
     ) -> None:
-        """Do a task with the worlds, by default all of them and with the first action and decision."""
-        acted = self._nothing if actions is None else actions
-        decided = self._nothing if decisions is None else decisions
-        marked = self._all_worlds if which is None else which
-        self.driver.run(task, (self.now, self.driver.tables, output, self.law, acted, decided, marked))
+        """Do a task with the selected worlds, by default with all of them.
 
-    def begin(self, output: StepOutput, which: Bool | None = None) -> StepOutput:
-        """Begin the next episode of some worlds and write their rows of `output`.
+        Agents take their first action and decision where none are given.
+        """
+        actions = self._first_choices if actions is None else actions
+        decisions = self._first_choices if decisions is None else decisions
+        selected = self._all_worlds if selected is None else selected
+        self.driver.run(task, (self.now, self.driver.tables, output, self.law, actions, decisions, selected))
+
+    def begin(self, output: StepOutput | None = None, selected: Bool | None = None) -> StepOutput:
+        """Begin the next episode of the selected worlds, and write their rows of the output.
 
         Args:
-            which: bool [B], the worlds that begin; None for all. Of a new batch, all worlds begin.
+            output: the output to write into; None for a new one.
+            selected: bool [B], True for worlds that begin; None for all. In a new batch all worlds must
+                begin.
         """
-        if which is not None:
-            if which.shape != (self.size,) or which.dtype != np.bool_:
-                raise ValueError(f"which is {which.dtype} {list(which.shape)}; allowed: bool [{self.size}]")
-            if not self.has_begun and not self.driver.read(which).all():
-                raise ValueError("which leaves worlds out; allowed at first: None, so that all worlds begin")
-        self._run(BEGIN, output, which=which)
+        if selected is not None:
+            if selected.shape != (self.size,) or selected.dtype != np.bool_:
+                raise ValueError(
+                    f"selected is {selected.dtype} {list(selected.shape)}; allowed: bool [{self.size}]"
+                )
+            if not self.has_begun and not self.driver.read(selected).all():
+                raise ValueError(
+                    "selected leaves worlds out; allowed at first: None, so that all worlds begin"
+                )
+        output = self.new_output() if output is None else output
+        self._run(BEGIN, output, selected=selected)
         self.has_begun = True
         return output
 
     def play(self, actions: Int64, output: StepOutput, decisions: Int64 | None = None) -> StepOutput:
-        """Play one turn of every world and write its output.
+        """Play one turn of every world, and write its output.
 
-        Nothing is checked, which would take as long as a turn of one world: `check` says whether actions of
-        unknown origin can be played, `check_decisions` whether decisions can.
+        Nothing is checked here, since a check takes as long as a turn of one world. Call `check` for actions
+        of unknown origin, and `check_decisions` for decisions.
 
         Args:
-            actions: int64 [B, N], contiguous.
-            decisions: int64 [B, N], contiguous, where agents decide something, see `Game.decisions`; read of
-                worlds in the first turn of an episode alone. None for the first option of all agents.
+            actions: int64 [B, N], contiguous, indices of `Game.actions`.
+            output: the output to write into.
+            decisions: int64 [B, N], contiguous, below `Game.decisions`; read only in the first turn of an
+                episode. None lets all agents take the first option.
         """
         self._run(PLAY, output, actions=actions, decisions=decisions)
         return output
 
     def boards(self, output: StepOutput) -> UInt8:
-        """Return the current boards: uint8 [B, H, W], classes of `cprl.commons.cells`."""
+        """Return the current boards as classes of cells (`cprl.commons.cells`): uint8 [B, H, W]."""
         boards = self.driver.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
         self.driver.show((self.now, self.driver.tables, boards))
         return boards
 
-    def show(self, output: StepOutput, *, world: int = 0) -> Shown:
+    def show(self, output: StepOutput, *, world: int = 0) -> WorldView:
         """Return a copy of one world for display; `output` holds its latest observation."""
-        read, observation = self.driver.read, output.observation[world]
-        of_world = {name: read(getattr(self.now, name))[world] for name in Shown._fields[2:]}
-        return Shown(read(observation), read(self.boards(output))[world], **of_world)
+        read = self.driver.read
+        return WorldView(
+            read(output.observation[world]),
+            read(self.boards(output))[world],
+            *(read(getattr(self.now, name))[world] for name in WorldView._fields[2:]),
+        )
 
     def state(self) -> states.State:
-        """Return the state of all worlds: copies of arrays [B, ...] by the names of `Worlds`.
+        """Return the state of all worlds: copies of the arrays in `Worlds` and `Law`, [B, ...], by name.
 
-        The state and the game together determine the future, including all random numbers.
+        State and game together determine everything that follows, including all random numbers.
         """
         return {name: self.driver.read(array) for name, array in self._state_arrays().items()}
 
     def _state_arrays(self) -> dict[str, NDArray[Any]]:
-        """Return the driver's arrays of a state by name."""
-        arrays = {name: array for name, array, _ in lasting(self.now)}
+        """Return the driver's arrays that make up the state, by name."""
+        arrays = {name: array for name, array, _ in state_arrays(self.now)}
         if self.law is not None:
-            arrays |= {name: array for name, array, _ in lasting(self.law)}
+            arrays |= {name: array for name, array, _ in state_arrays(self.law)}
         return arrays
 
-    def load(self, state: Mapping[str, NDArray[Any]], output: StepOutput) -> StepOutput:
-        """Set the state of the worlds and write it into `output`, with no harvest, shots, hits or growth,
-        whatever happened in the turn before.
+    def load(self, state: Mapping[str, NDArray[Any]], output: StepOutput | None = None) -> StepOutput:
+        """Restore a state of the worlds, and return the output that belongs to it.
+
+        Harvest, shots, hits and growth are 0 in this output: the events of the last turn are not part of a
+        state.
+
+        Args:
+            state: a result of `state`, of the same game and number of worlds.
+            output: the output to write into; None for a new one.
+
+        Raises:
+            ValueError: if the state does not fit the game; the worlds are then unchanged.
         """
-        sound, arrays = states.checked(state, worlds=self.size, game=self.game), self._state_arrays()
-        for name, values in sound.items():
+        checked_state = states.check_state(state, worlds=self.size, game=self.game)
+        arrays = self._state_arrays()
+        for name, values in checked_state.items():
             self.driver.write(arrays[name], values)
+        output = self.new_output() if output is None else output
         self._run(REFRESH, output)
-        self.has_begun = bool((sound["episode"] >= 0).all())
+        self.has_begun = bool((checked_state["episode"] >= 0).all())
         return output
 
     def check(self, actions: Int64) -> None:
@@ -197,12 +227,13 @@ class Batch:
         """Raise a ValueError for decisions, int64 [B, N], that agents cannot take."""
         self._check_known("decision", decisions, max(1, self.game.decisions))
 
-    def _check_known(self, what: str, chosen: Int64, known: int, names: tuple[str, ...] = ()) -> None:
-        at = self.driver.first_unknown(chosen, known)
-        if at >= 0:
-            world, agent = divmod(at, self.game.agents)
-            came = self.driver.read(chosen)[world, agent]
+    def _check_known(self, noun: str, choices: Int64, known: int, names: tuple[str, ...] = ()) -> None:
+        """Refuse choices, int64 [B, N], outside 0 .. known - 1; `noun` and `names` are for the message."""
+        invalid_index = self.driver.first_invalid(choices, known)
+        if invalid_index >= 0:
+            world, agent = divmod(invalid_index, self.game.agents)
+            choice = self.driver.read(choices)[world, agent]
             allowed = f"0 to {known - 1}" + (f" ({', '.join(names)})" if names else "")
             raise ValueError(
-                f"{what} {came} of agent {agent} in world {world} is unknown; allowed: {allowed}"
+                f"{noun} {choice} of agent {agent} in world {world} is unknown; allowed: {allowed}"
             )

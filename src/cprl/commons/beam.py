@@ -1,4 +1,8 @@
-"""The beam: the cells it covers, the agents it hits, and how they are tagged, on one world."""
+"""The beam: the cells it covers, the agents it hits, and how they are tagged. The rules work on one world.
+
+A beam has columns, each a row of cells ahead of the shooter. `side` is the offset of a column: 0 is straight
+ahead, negative to the left, positive to the right. `ahead` counts cells from the shooter, which is at 0.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,7 @@ from cprl.commons.quirks import turns_missed
 from cprl.institutions.mediation import mediate
 from cprl.institutions.punishment import punish
 from cprl.institutions.sanctions import sanction_tag
-from cprl.values.arrays import Bool
+from cprl.values.array_types import Bool
 
 if TYPE_CHECKING:
     from cprl.commons.tables import Tables
@@ -20,16 +24,17 @@ if TYPE_CHECKING:
 
 
 def note_shot(world: Worlds, i: int) -> None:
-    """Note from where agent i fires or cleans: it stays there in this turn, unless it is tagged and returns
-    somewhere else."""
+    """Note the cell and heading from which agent i fires or cleans.
+
+    It stays there for the rest of this turn, unless it is tagged and returns at a spawn place.
+    """
     world.shot_row[i] = world.row[i]
     world.shot_col[i] = world.col[i]
     world.shot_heading[i] = world.heading[i]
 
 
 def beam_cell(world: Worlds, tables: Tables, shooter: int, ahead: int, side: int) -> int:
-    """Return the cell that lies `ahead` cells ahead of where a shooter fired and `side` cells to its
-    right."""
+    """Return the cell that lies `ahead` cells ahead of a shooter and `side` cells to its right."""
     heading = world.shot_heading[shooter]
     right = (heading + 1) % 4
     row = world.shot_row[shooter] + ahead * ROW_STEP[heading] + side * ROW_STEP[right]
@@ -38,57 +43,57 @@ def beam_cell(world: Worlds, tables: Tables, shooter: int, ahead: int, side: int
 
 
 def beam_begin(tables: Tables, side: int) -> int:
-    """Return how many cells ahead the beam begins in its column at offset `side`: 1, or 0 beside the
-    shooter."""
+    """Return how many cells ahead a column of the beam begins: 1, or 0 if it begins beside the shooter."""
     return 0 if tables.beam_from_beside and side != 0 else 1
 
 
 def beam_end(world: Worlds, tables: Tables, shooter: int, side: int) -> int:
-    """Return how many cells ahead the beam ends at most in its column at offset `side`."""
+    """Return how many cells ahead a column of the beam ends where nothing stops it."""
     length = tables.beam_length[world.shot_heading[shooter]]
     return length - abs(side) if tables.beam_tapers else length
 
 
-def beam_reach(world: Worlds, tables: Tables, shooter: int, side: int, present: Bool) -> int:
-    """Return how many cells ahead the last cell is that the beam covers in its column at offset `side`: the
-    last one before a wall there, or under `beam_stops_at_agents` the first one with an agent that is present.
+def beam_reach(world: Worlds, tables: Tables, shooter: int, side: int, stands: Bool) -> int:
+    """Return how many cells ahead the last cell is that the beam covers in a column.
 
-    `present`: bool [N].
+    A wall stops the column before it, and under `beam_stops_at_agents` the first agent stops it on its cell.
+    `stands`: bool [N], the agents that can stop it.
     """
-    reach, end = beam_begin(tables, side) - 1, beam_end(world, tables, shooter, side)
+    reach = beam_begin(tables, side) - 1
+    end = beam_end(world, tables, shooter, side)
     while (
         reach < end
         and tables.background[beam_cell(world, tables, shooter, reach + 1, side)] != tables.paints[WALL]
     ):
         reach += 1
     if tables.beam_stops_at_agents:
-        return first_agent(world, tables, shooter, side, reach, present)
+        return first_agent(world, tables, shooter, side, reach, stands)
     return reach
 
 
-def first_agent(world: Worlds, tables: Tables, shooter: int, side: int, reach: int, present: Bool) -> int:
-    """Return how many cells ahead the first agent is in a column of a beam, or its reach if there is none."""
-    for i in range(present.shape[0]):
-        ahead, aside = place_in_beam(world, i, shooter)
-        stands = present[i] and not has_respawned(world, tables, i)
-        if stands and aside == side and ahead >= beam_begin(tables, side):
+def first_agent(world: Worlds, tables: Tables, shooter: int, side: int, reach: int, stands: Bool) -> int:
+    """Return how many cells ahead the first agent in a column of the beam is, `reach` if there is none."""
+    for i in range(stands.shape[0]):
+        ahead, agent_side = place_in_beam(world, i, shooter)
+        is_in_the_way = stands[i] and not has_respawned(world, tables, i)
+        if is_in_the_way and agent_side == side and ahead >= beam_begin(tables, side):
             reach = min(reach, ahead)
     return reach
 
 
 def has_respawned(world: Worlds, tables: Tables, i: int) -> bool:
-    """Return whether agent i was tagged in this turn and is back in play at a spawn place."""
+    """Return whether agent i was tagged in this turn and is already back in play, at a spawn place."""
     return tables.respawn_at_spawns and world.in_play[i] and world.tagged_step[i] == world.step[0]
 
 
 def place_in_beam(world: Worlds, i: int, shooter: int) -> tuple[int, int]:
-    """Return how many cells ahead of where a shooter fired, and how many to its right, agent i is."""
+    """Return where agent i is as seen from a shooter: the cells ahead of it, and the cells to its right."""
     heading = world.shot_heading[shooter]
     right = (heading + 1) % 4
-    rows = world.row[i] - world.shot_row[shooter]
-    cols = world.col[i] - world.shot_col[shooter]
-    ahead = rows * ROW_STEP[heading] + cols * COL_STEP[heading]
-    return ahead, rows * ROW_STEP[right] + cols * COL_STEP[right]
+    rows_down = world.row[i] - world.shot_row[shooter]
+    cols_right = world.col[i] - world.shot_col[shooter]
+    ahead = rows_down * ROW_STEP[heading] + cols_right * COL_STEP[heading]
+    return ahead, rows_down * ROW_STEP[right] + cols_right * COL_STEP[right]
 
 
 def is_hit(world: Worlds, tables: Tables, target: int, shooter: int) -> bool:
@@ -103,7 +108,10 @@ def is_hit(world: Worlds, tables: Tables, target: int, shooter: int) -> bool:
 
 
 def find_hits(world: Worlds, tables: Tables, hit_by: Bool) -> None:
-    """Find which agents in play are hit by whom, after all moves; `hit_by`: bool [N, N], row: agent hit."""
+    """Find the agents in play that beams hit after all moves.
+
+    Write `hit_by`, bool [N, N]: agent hit, shooter.
+    """
     agents = world.row.shape[0]
     for i in range(agents):
         for j in range(agents):
@@ -111,9 +119,10 @@ def find_hits(world: Worlds, tables: Tables, hit_by: Bool) -> None:
 
 
 def tag(world: Worlds, tables: Tables, law: Law | None, hit_by: Bool, tagged_by: Bool) -> None:
-    """Count hits, at most one per agent and turn, and tag agents with `hits_to_tag` hits; [N, N] each.
+    """Count hits, at most one per agent and turn, and tag agents that have `hits_to_tag` hits.
 
-    Institutions may have other time-outs, and fines, and refund unjust tags.
+    Institutions may change the time-out, fine the agents, and refund unjust tags. `hit_by` and `tagged_by`,
+    which is written, are bool [N, N]: agent hit, shooter.
     """
     for i in range(world.row.shape[0]):
         if count_hit(world, tables, hit_by, tagged_by, i):
@@ -131,7 +140,10 @@ def tag(world: Worlds, tables: Tables, law: Law | None, hit_by: Bool, tagged_by:
 
 
 def count_hit(world: Worlds, tables: Tables, hit_by: Bool, tagged_by: Bool, i: int) -> bool:
-    """Count at most one hit of agent i; the last of `hits_to_tag` tags it: write by whom, and return True."""
+    """Count at most one hit of agent i, and return whether this hit tags it.
+
+    Write into `tagged_by`, bool [N, N], which agents tagged agent i.
+    """
     is_hit_now = False
     for j in range(world.row.shape[0]):
         tagged_by[i, j] = False
@@ -148,7 +160,7 @@ def count_hit(world: Worlds, tables: Tables, hit_by: Bool, tagged_by: Bool, i: i
 
 
 def take_out(world: Worlds, i: int, freeze_steps: int) -> None:
-    """Take agent i out of play for at least so many turns."""
+    """Take agent i out of play for at least `freeze_steps` turns."""
     world.in_play[i] = False
     world.tagged_step[i] = world.step[0]
     world.out_steps[i] = max(world.out_steps[i], turns_missed(freeze_steps, world.groups.quirks))

@@ -1,7 +1,7 @@
-"""The classes of cells, and the colours in which agents observe them.
+"""The classes of cells on a board, and the colours in which agents observe them.
 
-Agents learn from these colours, which are those of the study: an agent sees itself in blue and others in red,
-whoever they are. Pictures for people have colours of their own, in `cprl.pictures.colours`.
+Agents learn from these colours, which are those of the published study: every agent sees itself in blue and
+all others in red. Pictures for people use other colours, see `cprl.pictures.colours`.
 """
 
 from colorsys import hsv_to_rgb
@@ -9,12 +9,13 @@ from typing import Final
 
 GROUND, WALL, APPLE, MARK, BEAM, OTHER, SELF = range(7)
 WATER, WASTE, CLEANING = range(8, 11)
-"""The classes; MARK is a heading mark, CLEANING the beam that cleans. Under `agents_apart`, each agent has a
-class from `FIRST_AGENT` on. No cell has class 7, which is left out so that stored boards stay readable."""
+"""The classes of cells. MARK shows the heading of an agent, CLEANING the beam that cleans a river. Under
+`Observation.agents_apart`, agent i has the class `FIRST_AGENT` + i. Class 7 is unused, so that the numbers in
+stored boards keep their meaning."""
 
 FIRST_AGENT: Final = 11
 MAX_AGENTS_APART: Final = 120
-"""The largest number of agents under `agents_apart`: a class takes eight bits of a paint."""
+"""The largest number of agents under `agents_apart`, since a class has to fit into eight bits of a paint."""
 
 CLASS_NAMES: Final = (
     *("ground", "wall", "apple", "heading", "beam", "other", "self", "unused"),
@@ -24,7 +25,7 @@ CLASS_NAMES: Final = (
 Colour = tuple[int, int, int]
 """Red, green and blue, 0..255."""
 
-COLOURS: Final[tuple[Colour, ...]] = (
+CLASS_COLOURS: Final[tuple[Colour, ...]] = (
     (10, 10, 10),
     (125, 125, 125),
     (0, 255, 0),
@@ -37,7 +38,7 @@ COLOURS: Final[tuple[Colour, ...]] = (
     (113, 75, 24),
     (100, 255, 255),
 )
-"""The colour of each class in windows [W, run]; from WATER on they are ours."""
+"""The colour of each class in windows: of the study [W, run] up to SELF, of cprl from WATER on."""
 
 _APART_COLOURS: Final[tuple[Colour, ...]] = (
     (86, 156, 255),
@@ -49,20 +50,23 @@ _APART_COLOURS: Final[tuple[Colour, ...]] = (
     (255, 130, 200),
     (200, 220, 90),
 )
-"""The colours of other agents in windows under `agents_apart`; stored agents learned from them, so they stay
-as they are."""
+"""The colours of the first agents in windows under `agents_apart`. Stored agents have learned from them, so
+they must not change."""
 
 
 def class_name(kind: int) -> str:
-    """Return the name of a class; an agent's class has the agent's name."""
+    """Return the name of a class of cells, for an agent's class the name of the agent."""
     return CLASS_NAMES[kind] if kind < FIRST_AGENT else f"agent_{kind - FIRST_AGENT}"
 
 
 def class_colour(kind: int) -> Colour:
-    """Return the colour of a class in windows; under `agents_apart` each agent has one of its own: eight
-    distinct ones, then hues in between."""
+    """Return the colour of a class of cells in windows.
+
+    Under `agents_apart` each agent has its own colour: the first eight are chosen by hand, further ones are
+    hues spread by the golden ratio.
+    """
     if kind < FIRST_AGENT:
-        return COLOURS[kind]
+        return CLASS_COLOURS[kind]
     agent = kind - FIRST_AGENT
     if agent < len(_APART_COLOURS):
         return _APART_COLOURS[agent]

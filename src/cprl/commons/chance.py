@@ -1,8 +1,8 @@
-"""Counter-based random numbers: a function of seed, world, episode, step, site and purpose alone.
+"""Counter-based random numbers, each computed from seed, world, episode, step, site and purpose alone.
 
-Philox4x32-10 (Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011).
-The seed is the key; the counter identifies the number: purpose and site, step, episode, world.
-So a world plays the same game in any batch, on any number of threads and on any device.
+So a world plays the same episodes in any batch, on any number of threads and on any device. The generator is
+Philox4x32-10 (Salmon, Moraes, Dror and Shaw, "Parallel random numbers: as easy as 1, 2, 3", SC 2011). Its key
+is the seed, and its counter identifies the number: purpose and site, step, episode, world.
 """
 
 from typing import TYPE_CHECKING, Annotated, Final
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from cprl.commons.world import Worlds
 
 SMALLEST_PROBABILITY: Final = 2**-32
-"""Chance is compared in 32 bits: a smaller probability could never come true, or would be rounded up."""
+"""The smallest probability above 0, since random words have 32 bits: a smaller one would be rounded."""
 Probability = Annotated[
     float,
     Where(
@@ -37,7 +37,7 @@ LOW_BYTE = 0xFF
 BYTE_BITS = 8
 REST_BITS = 24
 SITES_PER_DRAW = 16
-"""Sites that share one draw for the first bytes of their random words."""
+"""The number of sites that share one draw for the first bytes of their random words."""
 
 REGROWTH_FIRST_BYTE = 0 << 28
 REGROWTH_REST = 1 << 28
@@ -49,13 +49,14 @@ FIRST_STOCK = 6 << 28
 END = 7 << 28
 ORDER = 8 << 28
 POLLUTION = 9 << 28
-"""The purpose of a draw: the upper four bits of the first counter word; its lower bits number the draw."""
+"""The purposes of draws: the upper four bits of the first counter word. The lower bits number the draws of a
+purpose, e.g. by site."""
 
 
 def philox4x32(
     c0: np.uint64, c1: np.uint64, c2: np.uint64, c3: np.uint64, k0: np.uint64, k1: np.uint64
 ) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """Four uniform random 32-bit words, computed from a counter of four words and a key of two.
+    """Return four uniform random 32-bit words, computed from a counter of four words and a key of two.
 
     Words are held in uint64, so that no product overflows and plain Python (the CUDA simulator) gives the
     same result.
@@ -63,15 +64,20 @@ def philox4x32(
     for _ in range(ROUNDS):
         p0 = MULTIPLIER_0 * c0
         p1 = MULTIPLIER_1 * c2
-        c0, c1 = (p1 >> WORD_BITS) ^ c1 ^ k0, p1 & LOW_WORD
-        c2, c3 = (p0 >> WORD_BITS) ^ c3 ^ k1, p0 & LOW_WORD
+        c0 = (p1 >> WORD_BITS) ^ c1 ^ k0
+        c1 = p1 & LOW_WORD
+        c2 = (p0 >> WORD_BITS) ^ c3 ^ k1
+        c3 = p0 & LOW_WORD
         k0 = (k0 + KEY_STEP_0) & LOW_WORD
         k1 = (k1 + KEY_STEP_1) & LOW_WORD
     return c0, c1, c2, c3
 
 
 def draw(world: "Worlds", number: int) -> tuple[np.uint64, np.uint64, np.uint64, np.uint64]:
-    """Draw four random 32-bit words; `number` identifies the draw within this world, episode and step."""
+    """Draw four random 32-bit words for the current world, episode and step.
+
+    `number` identifies the draw among those of this step: a purpose plus e.g. the index of a site or agent.
+    """
     return philox4x32(
         np.uint64(number),
         np.uint64(world.step[0]),

@@ -1,227 +1,62 @@
-"""Compiles the rules: every target is built from the same plain Python functions.
+"""Compile the rules with Numba, for the CPU or the GPU, from the same plain Python functions.
 
-What relies on private parts of Numba is here, each in a function or constant of its own: `CPU_OPTIONS`,
-`kept_in`, `kept_on_disk`, `_is_kept` and `machine_code`; and in `cprl.commons.records` and `linking`.
-`tests/test_compat.py` has a test for each.
+`CPU_OPTIONS` and `machine_code` use private parts of Numba, as do the modules `disk_cache`, `records` and
+`linking`. `tests/system/test_compat.py` has a test for each of these parts.
 """
 
-import dis
-import hashlib
 import os
-import pickle
-import subprocess
-import sys
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache, partial
-from io import BytesIO
-from pathlib import Path
 from threading import Lock
-from types import CodeType, FunctionType, ModuleType
-from typing import Any, Final, get_args, get_type_hints
+from types import FunctionType
+from typing import Any, Final
 
 import numba
-import numpy as np
-from filelock import FileLock
 
+from cprl.commons.code_key import code_key, is_rule
+from cprl.commons.disk_cache import KEY_FILE, can_write, compile_with_disk_cache, numba_cache_in
 from cprl.commons.linking import AS_PART, AS_WHOLE
 from cprl.commons.records import VERSION, by_reference, type_of, with_local
-from cprl.institutions.arrays import is_record
 from cprl.system.libraries import relying_on
-from cprl.system.process import cache_folder, obey_parent
+from cprl.system.process import cache_folder
 from cprl.system.times import CLOCK
 from cprl.values import refusal
 
 RULES_VARIABLE: Final = "CPRL_RULES"
-"""The environment variable that says how rules run."""
-COMPILED, PLAIN = "compiled", "python"
-
-KEY_FILE: Final = "key.py"
-"""Stands for the file of what is kept in a folder."""
-
-Compiled = dict[str, Callable[..., Any]]
+"""The environment variable that says how rules run: "compiled" (the default) or "python"."""
+COMPILED_RULES: Final = "compiled"
+PLAIN_RULES: Final = "python"
+_SETTINGS: Final[Any] = numba.config
 
 CPU_OPTIONS: Final[Mapping[str, Any]] = {"nogil": True, "error_model": "numpy", "_nrt": False}
-"""Of `numba.njit`. `_nrt`, which is private, refuses any allocation inside a function, and spares the
-counting of references to the many arrays handed on, which would take fifty times as long as the game."""
-
-_SETTINGS: Final[Any] = numba.config
-_CHECKSUM_BYTES: Final = 16
-_WAIT_S: Final = 300.0
-"""How long a process waits for another one that compiles the same, before it does so itself."""
-
-
-@contextmanager
-def kept_in(folder: Path) -> Iterator[None]:
-    """While it is open, functions that are decorated with `cache=True` are kept in that folder.
-
-    Numba documents its setting as an environment variable, read when Numba is imported.
-    """
-    with relying_on("numba", "numba.config.CACHE_DIR"):
-        usual = _SETTINGS.CACHE_DIR
-    _SETTINGS.CACHE_DIR = str(folder)
-    try:
-        yield
-    finally:
-        _SETTINGS.CACHE_DIR = usual
-
-
-def kept_on_disk(function: FunctionType, *, in_child: Callable[[], Any] | None = None, **options: Any) -> Any:
-    """Compile a function with Numba, and keep it on disk as far as the disk takes it.
-
-    Of processes that lack it at the same time one compiles it, and the others wait and read it. Where it
-    cannot be kept or read, e.g. on a full disk, each compiles it. Files have a checksum, which is compared
-    before they are read: Numba would run damaged machine code, and stop at any other damage, each time.
-
-    Args:
-        in_child: gives the same compiled function in another process. A child then compiles it and this
-            process waits, so that it answers Ctrl-C: LLVM works for up to a minute without letting Python
-            look at signals.
-    """
-    try:
-        made: Any = numba.njit(**options, cache=True)(function)
-    except RuntimeError:  # no folder for it is writable
-        return numba.njit(**options)(function)
-    with relying_on("numba", "Dispatcher.compile and its cache"):
-        compile_for, stop_caching, folder = made.compile, made._cache.disable, Path(made.stats.cache_path)
-        files = made._cache._cache_file
-        files._open_for_write = _with_checksum(files._open_for_write)
-
-    def compiled_once(types: Any) -> Any:
-        try:
-            _remove_damaged(folder, f"*.{function.__name__}-*.nb[ic]")
-            if in_child is not None and not _is_child and not _is_kept(made, types):
-                _compile_in_child(in_child, types)
-            with _alone(folder / f"{function.__name__}.lock", but_if=f"*.{function.__name__}-*.nbi"):
-                return compile_for(types)
-        except OSError as error:
-            _warn(folder, str(error))
-            stop_caching()
-            return compile_for(types)  # what it gave before it was to be kept, if there is that
-
-    made.compile = compiled_once
-    return made
-
-
-def _with_checksum(open_for_write: Callable[[str], Any]) -> Callable[[str], Any]:
-    """Return what opens a file of Numba's cache and writes a checksum behind the rest, where Numba no longer
-    reads."""
-
-    @contextmanager
-    def opened(path: str) -> Iterator[BytesIO]:
-        content = BytesIO()
-        yield content
-        with open_for_write(path) as file:
-            file.write(content.getvalue() + _checksum(content.getvalue()))
-
-    return opened
-
-
-def _checksum(content: bytes) -> bytes:
-    return hashlib.blake2b(content, digest_size=_CHECKSUM_BYTES).digest()
-
-
-def _remove_damaged(folder: Path, pattern: str) -> None:
-    """Remove the files of a function if one is not as it was written, and name each such one in a warning."""
-    paths = sorted(folder.glob(pattern))
-    damaged = [str(path) for path in paths if not _is_whole(path)]
-    if damaged:
-        for path in paths:
-            path.unlink(missing_ok=True)
-        warnings.warn(
-            f"{', '.join(damaged)}: damaged, and removed; what it held is compiled again",
-            RuntimeWarning,
-            stacklevel=3,
-        )
-
-
-def _is_whole(path: Path) -> bool:
-    """Return whether a file is as it was written; one that another process has just removed does no harm."""
-    try:
-        content = path.read_bytes()
-    except FileNotFoundError:
-        return True
-    return content[-_CHECKSUM_BYTES:] == _checksum(content[:-_CHECKSUM_BYTES])
-
-
-def _is_kept(function: Any, types: Any) -> bool:
-    """Return whether the machine code of a function for arguments of these types is on disk and can be
-    read."""
-    with relying_on("numba", "the cache of a Dispatcher"):
-        cache, codegen = function._cache, function.targetctx.codegen
-        key_of, load = cache._index_key, cache._cache_file.load
-    try:
-        return load(key_of(types, codegen())) is not None
-    except Exception:  # of whatever kind a damaged file gives
-        return False
-
-
-_is_child = False
-"""Whether this process compiles for another one."""
-
-
-def _compile_in_child(function: Callable[[], Any], types: Any) -> None:
-    """Let a process of its own compile a function and keep it on disk; if it fails, nothing is kept."""
-    start = "from cprl.commons.compiled import compile_for_parent; compile_for_parent()"
-    words = [sys.executable, "-c", f"import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); {start}"]
-    surroundings = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    quiet = subprocess.DEVNULL
-    try:
-        child = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet, env=surroundings)
-    except OSError:  # e.g. where Python is part of another program
-        return
-    pipe = child.stdin
-    assert pipe is not None
-    try:
-        with suppress(OSError):  # it ended before it read all
-            pipe.write(pickle.dumps((function, types)))
-            pipe.flush()
-        child.wait()
-    finally:
-        child.kill()
-        child.wait()
-        with suppress(OSError):
-            pipe.close()
-
-
-def compile_for_parent() -> None:
-    """Compile what the process at the other end of standard input asks for, as long as it lives."""
-    global _is_child
-    _is_child = True
-    function, types = pickle.load(sys.stdin.buffer)
-    obey_parent()
-    function().compile(types)
-
-
-@contextmanager
-def _alone(path: Path, *, but_if: str) -> Iterator[None]:
-    """Hold a lock among processes, unless the folder of the lock has a file like `but_if`; without a lock
-    where it cannot be had, or not within minutes."""
-    lock = FileLock(path, timeout=_WAIT_S)
-    with ExitStack() as stack:
-        with suppress(OSError, NotImplementedError):  # `Timeout` is an OSError
-            if not any(path.parent.glob(but_if)):
-                stack.enter_context(lock)
-        yield
+"""The options of `numba.njit` for the CPU. The private option `_nrt` forbids allocations inside a function.
+References to the many arrays in arguments then need not be counted, which would take fifty times as long as
+the game."""
 
 
 def runs_plain() -> bool:
-    """Return whether rules run as the plain Python functions that they are: with CPRL_RULES=python in the
-    environment, or NUMBA_DISABLE_JIT=1. Print, breakpoints and coverage then work in them; they are some
-    hundred times slower."""
-    word = os.environ.get(RULES_VARIABLE, COMPILED)
-    if word not in (COMPILED, PLAIN):
-        raise refusal(RULES_VARIABLE, word, f'"{COMPILED}" and "{PLAIN}"')
-    return word == PLAIN or bool(_SETTINGS.DISABLE_JIT)
+    """Return whether rules run as plain Python functions, without being compiled.
+
+    They do with CPRL_RULES=python or NUMBA_DISABLE_JIT=1 in the environment. Print, breakpoints and coverage
+    then work in the rules, which are some hundred times slower.
+    """
+    mode = os.environ.get(RULES_VARIABLE, COMPILED_RULES)
+    if mode not in (COMPILED_RULES, PLAIN_RULES):
+        raise refusal(RULES_VARIABLE, mode, f'"{COMPILED_RULES}" and "{PLAIN_RULES}"')
+    return mode == PLAIN_RULES or bool(_SETTINGS.DISABLE_JIT)
 
 
 def machine_code(entry: Callable[..., Any], *arguments: Any) -> Callable[..., Any]:
-    """Return the machine code of an entry for arguments of the types of these, to be called directly.
+    """Compile an entry, and return a function that calls its machine code directly.
 
-    The first argument is a tuple, and may be a plain one in later calls. Numba's own call looks at the types
-    of all arguments each time; this one looks at none, so the caller must. `Dispatcher.compile` returns it,
-    which Numba does not document.
+    Numba's usual call inspects the types of all arguments each time. The returned function inspects none, so
+    the caller must make sure that they are those of `arguments`. Numba does not document that
+    `Dispatcher.compile` returns such a function.
+
+    Args:
+        entry: a function that drivers call, one of `cprl.commons.loops.ENTRIES`.
+        arguments: arguments of the types for which it is compiled. The first one is a named tuple; later
+            calls may pass a plain tuple in its place.
     """
     if runs_plain():
         make = getattr(type(arguments[0]), "_make", tuple)
@@ -234,61 +69,64 @@ def machine_code(entry: Callable[..., Any], *arguments: Any) -> Callable[..., An
 
 
 def compiled(
-    functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..., Any]], **others: Any
-) -> Compiled:
+    functions: Iterable[Any], jit: Callable[[FunctionType], Callable[..., Any]], **replacements: Any
+) -> dict[str, Callable[..., Any]]:
     """Compile plain functions, and before each of them the functions of `cprl` that it calls.
 
     Args:
-        others: functions to take in place of those of these names.
+        functions: the functions to compile.
+        jit: compiles one function, whose called functions are compiled already.
+        replacements: functions to call in place of those with the same names.
+
+    Returns:
+        The compiled functions by name.
     """
-    done: dict[FunctionType, Callable[..., Any]] = {}
+    compiled_functions: dict[FunctionType, Callable[..., Any]] = {}
 
     def compile_one(function: FunctionType) -> Callable[..., Any]:
-        if function not in done:
-            names = function.__globals__ | others
+        """Return a function compiled, from a copy whose global names are compiled functions."""
+        if function not in compiled_functions:
+            names = function.__globals__ | replacements
             for name in function.__code__.co_names:
                 called: Any = names.get(name)
-                if _is_rule(called):
+                if is_rule(called):
                     names[name] = compile_one(called)
             copy = FunctionType(function.__code__, names, function.__name__)
             copy.__dict__.update(function.__dict__)
-            done[function] = jit(copy)
-        return done[function]
+            compiled_functions[function] = jit(copy)
+        return compiled_functions[function]
 
     return {function.__name__: compile_one(function) for function in functions}
 
 
-def _is_rule(value: Any) -> bool:
-    """Return whether a name in a rule stands for a function that is compiled with it."""
-    return isinstance(value, FunctionType) and value.__module__.startswith("cprl.")
-
-
 def compiled_for_cpu(entry: Callable[..., Any], *, inline: bool = True) -> Any:
-    """Return a function compiled for CPU threads, with all rules that it calls, and kept on disk; the
-    function itself where rules run as plain Python.
+    """Return a function compiled for CPU threads, together with all rules that it calls.
 
-    Its folder is named after the code that it can reach, see `code_key`: what changes no rule compiles
-    nothing, also in another copy of this program.
+    The machine code is cached on disk in a folder named after the `code_key` of the function. So a change to
+    other code compiles nothing, and several copies of this program share the cache. The function itself is
+    returned where rules run as plain Python.
 
     Args:
-        inline: whether the rules become one piece of code, which runs faster and takes so long to compile
-            that a process of its own does it.
+        entry: the function to compile.
+        inline: whether it and all rules become one piece of machine code. This runs faster, but it takes so
+            long to compile that a child process does it.
     """
     return entry if runs_plain() else _compiled_for_cpu(entry, inline)
 
 
 _ONE_AT_A_TIME: Final = Lock()
-"""`kept_in` changes a setting of the whole process."""
+"""Held while rules are compiled, since `numba_cache_in` changes a setting of the whole process."""
 
 
 @cache
 def _compiled_for_cpu(entry: Any, inline: bool) -> Any:
+    """Return a compiled function, see `compiled_for_cpu`; a child process calls this too."""
     options = dict(CPU_OPTIONS)
-    inner = options | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    rule_options = options | {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
     if inline:
-        inner["forceinline"] = True
+        rule_options["forceinline"] = True
         options["no_cfunc_wrapper"] = True
-        inner |= AS_PART
+        rule_options |= AS_PART
         options |= AS_WHOLE
     key = code_key(entry, records=VERSION, inline=inline, **CPU_OPTIONS)
     folder = cache_folder() / "rules" / f"{entry.__name__}-{key}"
@@ -298,111 +136,19 @@ def _compiled_for_cpu(entry: Any, inline: bool) -> Any:
         if sliced is not None:
             return by_reference(sliced)
         if function.__code__ is entry.__code__ and not inline:
-            return kept(function)
-        return numba.njit(**inner)(function)
+            return compile_entry(function)
+        return numba.njit(**rule_options)(function)
 
-    def kept(function: FunctionType) -> Any:
-        if not _can_write(folder):
+    def compile_entry(function: FunctionType) -> Any:
+        if not can_write(folder):
             return numba.njit(**options)(function)
-        # Numba asks when the file of a function was changed, and where it is, which says nothing of the rules
-        # that it calls: so it stands in a file of its folder.
+        # Numba uses cached code as long as path and date of the function's source file stay the same. They do
+        # not change with the rules that it calls, so its code claims to come from a file in the folder of its
+        # key.
         function.__code__ = function.__code__.replace(co_filename=str(folder / KEY_FILE), co_firstlineno=1)
         in_child = partial(_compiled_for_cpu, entry, inline) if inline else None
-        return kept_on_disk(function, in_child=in_child, **options)
+        return compile_with_disk_cache(function, in_child=in_child, **options)
 
-    with _ONE_AT_A_TIME, kept_in(folder):
-        made = compiled([entry], jit)[entry.__name__]
-        return kept(with_local(entry, made)) if inline else made
-
-
-def code_key(entry: Any, **options: Any) -> str:
-    """Return a hash of the code that a function can reach: its own, that of the functions of `cprl` that it
-    calls, the constants that they name, and the fields of their tuples; and of options of the compiler.
-
-    Docstrings, comments, annotations, the places of lines, and whatever no rule calls do not count.
-    """
-    parts: dict[Any, str] = {"options": repr(sorted(options.items()))}
-    _note_function(entry, parts)
-    return hashlib.sha256(repr(sorted(parts.values())).encode()).hexdigest()[:16]
-
-
-def _note_function(function: FunctionType, parts: dict[Any, str]) -> None:
-    """Note the code of a function with what the names in it stand for, and the functions that it calls."""
-    if function in parts:
-        return
-    codes = list(_codes(function.__code__))
-    names = sorted({name for code in codes for name in code.co_names})
-    parts[function] = f"{_place(function)} {[_text_of(code) for code in codes]}"
-    for name in names:
-        value: Any = function.__globals__.get(name)
-        parts[function] += f", {name}: {_meaning(value)}"
-        if isinstance(value, ModuleType) and value.__name__.startswith("cprl."):
-            parts[function] += f" {[_meaning(getattr(value, inner, None)) for inner in names]}"
-        if _is_rule(value):
-            _note_function(value, parts)
-        elif is_record(value):
-            _note_tuple(value, parts)
-
-
-def _note_tuple(kind: Any, parts: dict[Any, str]) -> None:
-    """Note the fields of a named tuple, and of the tuples in it."""
-    if kind in parts:
-        return
-    parts[kind] = f"{_place(kind)} {kind._fields}"
-    for hint in get_type_hints(kind).values():
-        for inner in filter(is_record, (hint, *get_args(hint))):
-            _note_tuple(inner, parts)
-
-
-def _place(value: Any) -> str:
-    return f"{value.__module__}.{value.__qualname__}"
-
-
-def _meaning(value: Any) -> str:
-    """Return what a name in a rule stands for; modules and builtins are those of the versions installed."""
-    if _is_rule(value) or is_record(value):
-        return _place(value)
-    if isinstance(value, np.ndarray):
-        return f"{value.dtype} {value.shape} {value.tobytes().hex()}"
-    return repr(value) if isinstance(value, int | float | str | tuple | np.generic) else ""
-
-
-def _codes(code: CodeType) -> Iterator[CodeType]:
-    """Yield a code object and those in it."""
-    yield code
-    for constant in code.co_consts:
-        if isinstance(constant, CodeType):
-            yield from _codes(constant)
-
-
-def _text_of(code: CodeType) -> str:
-    """Return the instructions of a code object with the names and constants that they use."""
-    return str([(step.opname, _argument(step.argval)) for step in dis.get_instructions(code)])
-
-
-def _argument(value: Any) -> str:
-    return "" if isinstance(value, CodeType) else repr(value)
-
-
-def _can_write(folder: Path) -> bool:
-    """Return whether compiled rules can be cached in a folder; warns of the cost if not."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            if not (folder / KEY_FILE).exists():
-                (folder / KEY_FILE).touch()
-            return True
-        reason = "it is not writable"
-    except OSError as error:
-        reason = str(error)
-    _warn(folder, reason)
-    return False
-
-
-def _warn(folder: Path, reason: str) -> None:
-    warnings.warn(
-        f"the compiled rules cannot be cached in {folder} ({reason}): every process compiles them again, "
-        "which takes from 20 seconds to two minutes of a processor; set CPRL_CACHE to a writable folder",
-        RuntimeWarning,
-        stacklevel=3,
-    )
+    with _ONE_AT_A_TIME, numba_cache_in(folder):
+        compiled_entry = compiled([entry], jit)[entry.__name__]
+        return compile_entry(with_local(entry, compiled_entry)) if inline else compiled_entry

@@ -1,6 +1,6 @@
-"""CudaThreads: runs the rules with numba-cuda, one GPU thread per world.
+"""CudaThreads: runs the rules on a GPU with numba-cuda, one GPU thread per world.
 
-With NUMBA_ENABLE_CUDASIM=1 Numba simulates all of this without a GPU: slowly, as a check.
+With NUMBA_ENABLE_CUDASIM=1 Numba simulates the GPU on the CPU, which is slow and serves tests.
 """
 
 from collections.abc import Callable
@@ -14,18 +14,18 @@ from numpy.typing import DTypeLike, NDArray
 from cprl.commons.compiled import compiled
 from cprl.commons.game import Game
 from cprl.commons.loops import ENTRIES, Played, one_scratch
-from cprl.commons.rules import Groups
+from cprl.commons.rules import RuleGroups
 from cprl.commons.tables import Tables
 from cprl.commons.world import Scratch, Worlds, empty_scratch
-from cprl.institutions.arrays import changed
-from cprl.values.arrays import Int64
+from cprl.institutions.arrays import map_arrays
+from cprl.values.array_types import Int64
 
 cuda: Any = numba.cuda
 
 THREADS_PER_BLOCK: Final = 64
 
-NONE_UNKNOWN: Final = 2**62
-"""The initial result of the search for unknown actions: larger than any index."""
+NONE_INVALID: Final = 2**62
+"""The result of a search for unknown actions that finds none: larger than any index."""
 
 
 class CudaThreads:
@@ -50,13 +50,14 @@ class CudaThreads:
                 for array in empty_scratch(game)
             )
         )
-        self._unknown = cuda.to_device(np.full(1, NONE_UNKNOWN, np.int64))
+        self._lowest_invalid = cuda.to_device(np.full(1, NONE_INVALID, np.int64))
+        """The result of the search for unknown actions, in GPU memory: int64 [1]."""
 
     def place(self, arrays: Any) -> Any:
-        return changed(arrays, _placed)
+        return map_arrays(arrays, _copy_to_gpu)
 
     def wrap(self, memory: Any) -> NDArray[Any]:
-        """Return a Numba array on GPU memory of another owner, such as a torch tensor; shares the memory."""
+        """Return a Numba array that shares the GPU memory of e.g. a torch tensor."""
         array: NDArray[Any] = cuda.as_cuda_array(memory)
         return array
 
@@ -70,28 +71,28 @@ class CudaThreads:
     def write(self, array: Any, values: NDArray[Any]) -> None:
         array.copy_to_device(np.asfortranarray(values))
 
-    def first_unknown(self, actions: Int64, known: int) -> int:
-        self._unknown.copy_to_device(np.full(1, NONE_UNKNOWN, np.int64))
-        kernels(()).find_unknown[_blocks(len(actions)), THREADS_PER_BLOCK](actions, known, self._unknown)
-        at = int(self._unknown.copy_to_host()[0])
-        return -1 if at == NONE_UNKNOWN else at
+    def first_invalid(self, actions: Int64, known: int) -> int:
+        self._lowest_invalid.copy_to_device(np.full(1, NONE_INVALID, np.int64))
+        find_invalid = kernels(()).find_invalid[_blocks(len(actions)), THREADS_PER_BLOCK]
+        find_invalid(actions, known, self._lowest_invalid)
+        index = int(self._lowest_invalid.copy_to_host()[0])
+        return -1 if index == NONE_INVALID else index
 
     def run(self, task: int, game: tuple[Any, ...]) -> None:
-        """See `cprl.commons.batch.Driver`; the loop starts on the default stream, and this returns before it
-        has finished."""
+        """Start a task on the default stream, and return before it has finished; see `Driver.run`."""
         kernel, arguments = to_run(game)
         kernel[self._launch](*arguments, task, self._scratch)
 
     def show(self, game: tuple[Any, ...]) -> None:
-        """See `cprl.commons.batch.Driver`."""
+        """Draw the boards of the worlds; see `Driver.show`."""
         kernel, arguments = to_show(game)
         kernel[self._launch](*arguments, self._scratch)
 
 
 def to_run(game: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
-    """Return the kernel that runs a game, see `Driver.run`, and its arguments before the task."""
-    worlds, tables, output, law, *decided = game
-    arguments = _without_none(worlds), tables, output, law or (), *decided
+    """Return the kernel that does tasks with a game, see `Driver.run`, and its arguments before the task."""
+    worlds, tables, output, law, *choices = game
+    arguments = _without_none(worlds), tables, output, law or (), *choices
     return kernels(_absent(worlds, law)).run, arguments
 
 
@@ -102,69 +103,75 @@ def to_show(game: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
 
 
 def _absent(worlds: Worlds, law: Any) -> tuple[str, ...]:
-    """Return the names of the groups of rules that a game lacks, and "law" without institutions."""
+    """Return the names of the groups of rules that a game lacks; "law" stands for institutions."""
     groups = (name for name, group in worlds.groups._asdict().items() if group is None)
     return *groups, *(("law",) if law is None else ())
 
 
 def _without_none(worlds: Worlds) -> Any:
-    """Return worlds with empty tuples in place of the groups that the game lacks: a kernel takes no None."""
-    return worlds._replace(groups=cast(Any, Groups)(*(group or () for group in worlds.groups)))
+    """Return worlds with empty tuples in place of the groups that the game lacks; kernels take no None."""
+    return worlds._replace(groups=cast(Any, RuleGroups)(*(group or () for group in worlds.groups)))
 
 
-def _nothing(arrays: Any, b: int) -> None:
-    """Take the place of the function that takes world b out of the arrays of a group that a game lacks."""
+def _no_arrays(arrays: Any, b: int) -> None:
+    """Return None for world b of a group that a game lacks, in place of the function made by `slicer`."""
     return
 
 
 class Kernels(NamedTuple):
-    """The kernels of games that lack the same groups; compiled at their first launch."""
+    """The kernels of games that lack the same groups of rules. Each is compiled at its first launch."""
 
     run: Any
     show: Any
-    find_unknown: Any
+    find_invalid: Any
 
 
 @cache
 def kernels(absent: tuple[str, ...]) -> Kernels:
-    """Return the kernels of games without these groups: thread b runs a loop on world b alone."""
-    others = {f"one_{name}": _nothing for name in absent}
-    rules = compiled((*ENTRIES, one_scratch), cuda.jit(device=True), **others)
-    run_worlds, show_worlds, cut = (rules[name] for name in ("run_worlds", "show_worlds", "one_scratch"))
+    """Return the kernels of games that lack these groups; in a kernel, thread b works on world b alone."""
+    replacements = {f"one_{name}": _no_arrays for name in absent}
+    rules = compiled((*ENTRIES, one_scratch), cuda.jit(device=True), **replacements)
+    run_worlds = rules["run_worlds"]
+    show_worlds = rules["show_worlds"]
+    scratch_of = rules["one_scratch"]
 
     @cuda.jit
-    def run(worlds, tables, output, law, actions, decisions, which, task, scratch):  # type: ignore[no-untyped-def]
+    def run(worlds, tables, output, law, actions, decisions, selected, task, scratch):  # type: ignore[no-untyped-def]
         b = cuda.grid(1)
-        if b < which.shape[0]:
-            played = Played(worlds, tables, output, law, actions, decisions, which)
-            run_worlds(played, task, cut(scratch, b), b, b + 1)
+        if b < selected.shape[0]:
+            game = Played(worlds, tables, output, law, actions, decisions, selected)
+            run_worlds(game, task, scratch_of(scratch, b), b, b + 1)
 
     @cuda.jit
     def show(worlds, tables, boards, scratch):  # type: ignore[no-untyped-def]
         b = cuda.grid(1)
         if b < boards.shape[0]:
-            show_worlds((worlds, tables, boards), cut(scratch, b), b, b + 1)
+            show_worlds((worlds, tables, boards), scratch_of(scratch, b), b, b + 1)
 
-    return Kernels(run, show, _find_unknown(rules["first_unknown"]))
+    return Kernels(run, show, _find_invalid(rules["first_invalid"]))
 
 
-def _find_unknown(first_unknown: Callable[..., int]) -> Any:
-    """Thread b checks the actions of world b."""
+def _find_invalid(first_invalid: Callable[..., int]) -> Any:
+    """Return the kernel that writes the lowest row-major index of an unknown action; its thread b checks
+    world b."""
 
     @cuda.jit
     def kernel(actions, known, lowest):  # type: ignore[no-untyped-def]
         b = cuda.grid(1)
         if b < actions.shape[0]:
-            at = first_unknown(actions[b], known)
-            if at >= 0:
-                cuda.atomic.min(lowest, 0, b * actions.shape[1] + at)
+            agent = first_invalid(actions[b], known)
+            if agent >= 0:
+                cuda.atomic.min(lowest, 0, b * actions.shape[1] + agent)
 
     return kernel
 
 
-def _placed(array: NDArray[Any], is_of_worlds: bool) -> Any:
-    return cuda.to_device(np.asfortranarray(array) if is_of_worlds else array)
+def _copy_to_gpu(array: NDArray[Any], has_worlds: bool) -> Any:
+    """Return a copy on the GPU, with the axis B innermost if the array has one."""
+    ordered = np.asfortranarray(array) if has_worlds else array
+    return cuda.to_device(ordered)
 
 
 def _blocks(worlds: int) -> int:
+    """Return the number of blocks of threads that a kernel for B worlds needs."""
     return -(-worlds // THREADS_PER_BLOCK)

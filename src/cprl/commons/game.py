@@ -1,4 +1,4 @@
-"""Game: a Map, its Rules, the agents' Observation, and the institutions that they live under."""
+"""Game: joins a map, its rules, the form of observations, and institutions to one value."""
 
 import warnings
 from dataclasses import dataclass, field, fields
@@ -19,18 +19,18 @@ from cprl.commons.spaces import Spaces
 from cprl.commons.tables import Tables, build_tables, check_sizes
 from cprl.commons.world import StepOutput
 from cprl.commons.yields import sustainable_yield
-from cprl.institutions import COUNTS, Institution, law
+from cprl.institutions import COUNT_NAMES, Institution, law
 from cprl.institutions.arrays import Form, forms_of
-from cprl.institutions.base import Ballot
+from cprl.institutions.institution import Ballot
 from cprl.values import Value
-from cprl.values.arrays import Int32, UInt8
+from cprl.values.array_types import Int32, UInt8
 
 
 @dataclass(frozen=True, kw_only=True)
 class Game(Value):
-    """A map, its rules, what agents observe, and the rules that people make.
+    """A game: a map, the rules of nature, the observation of agents, and institutions, the rules of people.
 
-    Warns (UserWarning) if no agent can reach a site that it may harvest: nobody then gets an apple.
+    Warns (UserWarning) if no agent can reach a site that it may harvest, so that nobody ever gets an apple.
     """
 
     map: Map
@@ -39,12 +39,13 @@ class Game(Value):
     institutions: tuple[Institution, ...] = ()
 
     def _repr_html_(self) -> str:
-        """Return the board and the rules in words, for notebooks; the game knows nothing of pictures."""
+        """Return the board and the rules in words, as HTML for notebooks."""
+        # imported by name, since the game must not depend on pictures
         return import_module("cprl.pictures.readable").game_html(self)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        agents, rules = self.agents, self.rules
+        rules = self.rules
         if rules.respawn_at_spawns and not self.map.spawns:
             raise ValueError(
                 "Rules.respawn_at_spawns is True and Map.spawns is empty; allowed: a map with spawn places"
@@ -61,9 +62,9 @@ class Game(Value):
                 "regrow_prob[0] is 0, so no apple can ever grow; allowed: a share of at least one site"
             )
         check_sizes(self.map, rules)
-        if self.observation.agents_apart and agents > cells.MAX_AGENTS_APART:
+        if self.observation.agents_apart and self.agents > cells.MAX_AGENTS_APART:
             raise ValueError(
-                f"Observation.agents_apart is True and the map has {agents} agents; allowed: at most "
+                f"Observation.agents_apart is True and the map has {self.agents} agents; allowed: at most "
                 f"{cells.MAX_AGENTS_APART}"
             )
         law.check_institutions(self)
@@ -77,103 +78,112 @@ class Game(Value):
 
     @property
     def agents(self) -> int:
-        """The number of agents N."""
+        """Return the number of agents N."""
         return self.map.agents
 
     @property
     def agent_names(self) -> tuple[str, ...]:
-        """agent_0, agent_1, ..., one for each agent."""
+        """Return agent_0, agent_1, ..., one name for each agent."""
         return tuple(f"agent_{i}" for i in range(self.agents))
 
     @property
     def actions(self) -> tuple[str, ...]:
-        """The names of the actions; an action is its index in this tuple."""
+        """Return the names of the actions; an action is its index in this tuple."""
         return self.rules.actions
 
     @property
     def channels(self) -> tuple[str, ...]:
-        """The name of each channel of an observation: "red", "green", "blue", or the classes of cells, then
-        one for each signal, then the planes of `Observation`, then those of institutions, see
-        `cprl.commons.views`."""
-        return *self.own_channels, *self._institution_channels
+        """Return the names of the channels of an observation, in their order.
+
+        First come the channels of the board: "red", "green" and "blue", or the classes of cells. Then come a
+        channel for each signal, the scoreboard and stock gauge of `Observation`, and the channels of
+        institutions, see `cprl.commons.views`.
+        """
+        return *self.game_channels, *self._institution_channels
 
     @property
-    def own_channels(self) -> tuple[str, ...]:
-        """All channels but those of institutions, which come last."""
+    def game_channels(self) -> tuple[str, ...]:
+        """Return the names of the channels before those of institutions."""
         signals = (f"signal {number + 1}" for number in range(self.rules.signals))
         return *self.cell_channels, *signals, *self.score_channels
 
     @property
     def cell_channels(self) -> tuple[str, ...]:
-        """The channels that show the board, which come first."""
+        """Return the names of the first channels, which show the board."""
         if self.observation.encoding == "rgb":
             return "red", "green", "blue"
         return tuple(map(cells.class_name, self.cell_classes))
 
     @property
     def cell_classes(self) -> tuple[int, ...]:
-        """The classes of cells that can occur, in the order of the channels of "one_hot"."""
-        apart = [cells.FIRST_AGENT + agent for agent in range(self.agents)]
-        agents = apart if self.observation.agents_apart else [cells.OTHER]
-        river = [cells.WATER, cells.WASTE, cells.CLEANING] if self.map.river else []
-        always = range(cells.GROUND, cells.BEAM + 1)
-        return *always, *sorted([*agents, cells.SELF, *river])
+        """Return the classes of cells that can occur, in the order of the channels of "one_hot"."""
+        agent_classes = [cells.OTHER]
+        if self.observation.agents_apart:
+            agent_classes = [cells.FIRST_AGENT + agent for agent in range(self.agents)]
+        river_classes = [cells.WATER, cells.WASTE, cells.CLEANING] if self.map.river else []
+        common_classes = range(cells.GROUND, cells.BEAM + 1)
+        return *common_classes, *sorted([*agent_classes, cells.SELF, *river_classes])
 
     @property
     def score_channels(self) -> tuple[str, ...]:
-        """The channels "scoreboard" and "stock_gauge", for those that `Observation` has."""
-        planes = {"scoreboard": -(-self.agents // prod(self._seen)), "stock_gauge": 1}
-        return tuple(
-            name for name, count in planes.items() if getattr(self.observation, name) for _ in range(count)
-        )
+        """Return the names of the channels of scoreboard and stock gauge, if `Observation` has them."""
+        names = ["scoreboard"] * self._planes_for(self.agents) + ["stock_gauge"]
+        return tuple(name for name in names if getattr(self.observation, name))
 
     @property
     def _institution_channels(self) -> tuple[str, ...]:
-        entries = len(self.entries_shown)
-        places = ("forbidden",) if law.shows_places(self) else ()
-        return *places, *("institutions",) * -(-entries // prod(self._seen))
+        """Return the names of the channels in which institutions show something to agents."""
+        place_channels = ("forbidden",) if law.shows_places(self) else ()
+        return *place_channels, *("institutions",) * self._planes_for(len(self.entries_shown))
+
+    def _planes_for(self, entries: int) -> int:
+        """Return the number of channels that have at least one cell for each of these entries."""
+        return -(-entries // prod(self._observed_size))
 
     @property
     def entries_shown(self) -> tuple[str, ...]:
-        """What the entries of the channels "institutions" show, each with the number of its kind: "quota left
-        0"; see `shown` in the modules of institutions."""
+        """Return the names of the entries in the channels "institutions".
+
+        An entry is a number that an institution shows agents, e.g. "quota left 0", the apples left by the
+        first quota of the game; see `cprl.institutions.hooks.shown_value`.
+        """
         return tuple(f"{entry} {number}" for entry, number in law.entries_shown(self))
 
     @property
-    def _seen(self) -> tuple[int, int]:
-        """The rows and columns of an observation."""
+    def _observed_size(self) -> tuple[int, int]:
+        """Return the numbers of rows and columns of an observation."""
         if self.observation.area == "full":
             return self.map.height, self.map.width
         return self.rules.window_rows + self.rules.window_rows_behind, self.rules.window_columns
 
     @property
     def observation_highest(self) -> int:
-        """The largest value of an entry of observations: 255, or 1 for "one_hot" without planes."""
+        """Return the largest value in observations: 255, or 1 for "one_hot" with channels of cells alone."""
         return 255 if self.score_channels or self._institution_channels else self.observation.highest
 
     @property
     def observation_shape(self) -> tuple[int, int, int]:
-        """The shape (C, X, Y) of one agent's observation: channels, rows, columns."""
-        return len(self.channels), *self._seen
+        """Return the shape (C, X, Y) of one agent's observation: channels, rows, columns."""
+        return len(self.channels), *self._observed_size
 
     @property
     def ballots(self) -> tuple[Ballot, ...]:
-        """What agents decide on at an episode's first turn, in the order of `institutions`.
+        """Return the ballots of an episode's first turn, in the order of `institutions`.
 
-        A decision is one number for all ballots: the choice of the first one plus its number of choices times
-        the choice of the second one, and so on.
+        An agent's decision is one number for all ballots: the index of its choice on the first ballot, plus
+        the number of choices there times the index of its choice on the second ballot, and so on.
         """
         ballots = (institution.ballot(self.agents) for institution in self.institutions)
         return tuple(ballot for ballot in ballots if ballot is not None)
 
     @property
     def decisions(self) -> int:
-        """The number of options of ("agents", "decision"); 0 where there is nothing to decide."""
+        """Return the number of options of ("agents", "decision"); 0 if agents decide nothing."""
         return prod(len(ballot.choices) for ballot in self.ballots) if self.ballots else 0
 
     @property
     def spaces(self) -> Spaces:
-        """What each agent observes and may do."""
+        """Return the observation and action spaces, which are the same for each agent."""
         return Spaces(
             agents=self.agents,
             observation_shape=self.observation_shape,
@@ -182,39 +192,41 @@ class Game(Value):
         )
 
     def make(self, worlds: int, seed: int, device: Any = "cpu", first_world: int = 0) -> Any:
-        """Return a `CommonsEnv` of so many worlds, as every game that an experiment plays makes one.
+        """Return a `CommonsEnv` of the game; every game that an experiment plays has such a method.
 
         Args:
-            first_world: the index of the first world, as `CommonsEnv` takes it.
+            worlds: the number of worlds B.
+            seed: the seed of all random numbers.
+            device: "cpu", or "cuda" for a GPU.
+            first_world: the index of the first world, as in `CommonsEnv`.
         """
-        envs = import_module("cprl.envs.commons_env")  # the game itself knows nothing of torch
+        envs = import_module("cprl.envs.commons_env")  # imported by name: the game must not depend on torch
         return envs.CommonsEnv(self, worlds, seed=seed, device=device, first_world=first_world)
 
     @property
     def palette(self) -> UInt8:
-        """The colour of each class of cell: uint8 [classes, 3], red, green and blue."""
+        """Return the colour of each class of cell: uint8 [classes, 3], red, green and blue."""
         classes = cells.FIRST_AGENT + (self.agents if self.observation.agents_apart else 0)
         return np.array([cells.class_colour(kind) for kind in range(classes)], np.uint8)
 
     @cached_property
     def tables(self) -> Tables:
-        """The lookup tables that the compiled rules read; computed once and cached."""
+        """Build the lookup tables that the compiled rules read, once."""
         return build_tables(self)
 
     @cached_property
     def law_parameters(self) -> dict[str, dict[str, Any]]:
-        """The parameters of the game's institutions; computed once and cached."""
+        """Compute the parameters of the game's institutions, once."""
         return law.parameters(self)
 
     @cached_property
     def sustainable_yield(self) -> float:
-        """Apples a turn that the map can bear, see `cprl.commons.yields`; computed once and cached."""
+        """Compute the apples per turn that the map yields for ever, once; see `cprl.commons.yields`."""
         return sustainable_yield(self.map, self.rules)
 
     @cached_property
     def patches(self) -> Int32:
-        """The patch of each site, int32 [K]: sites that are connected by being near each other; computed once
-        and cached."""
+        """Find the index of each site's patch, int32 [K], once; see `cprl.commons.near.patches`."""
         return patches(sites_around(self.map, self.rules))
 
     def __getstate__(self) -> dict[str, object]:
@@ -222,21 +234,18 @@ class Game(Value):
 
 
 def _why_out_of_reach(game: Game) -> str | None:
-    """Return a sentence that says why no agent can harvest any site, e.g. since a wall parts them; None if
-    one can.
+    """Return a warning that says why no agent can ever harvest any site; None if an agent can.
 
-    Agents walk over all cells but walls, also through each other's, since others may move away. `Boundaries`
-    without a fine stop bites, not steps. Under `shuffle_starts` any agent may start at any start.
+    Agents can walk over all cells but walls, also over cells of other agents, which may move away.
+    `Boundaries` without a fine stop harvests and not steps. Under `shuffle_starts` any agent may start at any
+    start.
     """
     board = game.map
     if not board.walls and not game.institutions:
         return None
-    allowed = np.array(
-        [
-            [all(rule.may_harvest(agent, *site) for rule in game.institutions) for site in board.sites]
-            for agent in range(game.agents)
-        ]
-    )
+    allowed = np.ones((game.agents, len(board.sites)), np.bool_)
+    for agent, site in np.ndindex(allowed.shape):
+        allowed[agent, site] = all(rule.may_harvest(agent, *board.sites[site]) for rule in game.institutions)
     if not board.walls and allowed.all():
         return None
     from scipy.ndimage import label
@@ -244,14 +253,16 @@ def _why_out_of_reach(game: Game) -> str | None:
     is_open = np.ones((board.height, board.width), np.bool_)
     for wall in board.walls:
         is_open[wall] = False
-    part = label(is_open)[0]  # the number of the part of the board around each cell that walls enclose
+    room_of_cell = label(is_open)[0]  # a room is a part of the board that walls enclose
+    room_of_site = room_of_cell[tuple(np.transpose(board.sites))]
     starts = [(row, col) for row, col, _ in board.starts]
-    begins = [board.spawns if start in board.spawns else (start,) for start in starts]
-    of_sites = np.array([part[site] for site in board.sites])
-    walks = np.array([np.isin(of_sites, [part[cell] for cell in places]) for places in begins])
+    reachable = np.zeros_like(allowed)
+    for agent, start in enumerate(starts):
+        first_cells = board.spawns if start in board.spawns else (start,)
+        reachable[agent] = np.isin(room_of_site, room_of_cell[tuple(np.transpose(first_cells))])
     if game.rules.shuffle_starts:
-        walks[:] = walks.any(0)
-    if (allowed & walks).any():
+        reachable[:] = reachable.any(0)
+    if (allowed & reachable).any():
         return None
     first_three = "; ".join(f"row {row}, column {col}" for row, col in starts[:3])
     return (
@@ -262,9 +273,20 @@ def _why_out_of_reach(game: Game) -> str | None:
 
 
 def output_forms(game: Game, worlds: int) -> dict[str, Form]:
-    """Return the shape and dtype of each array of `StepOutput`, for B worlds of a game."""
-    sizes = {"B": worlds, "N": game.agents}
-    turn = dict(zip("CXY", game.observation_shape, strict=True))
-    turn |= {"P": 1, "M": game.agents} if game.map.river else {"P": 0, "M": 0}
-    governed = {"L": game.agents if game.institutions else 0, "counts": len(COUNTS), "V": len(game.ballots)}
-    return forms_of(StepOutput, **sizes, **turn, **governed, U=int(paints_over(game.rules.quirks)))
+    """Return the shape and dtype of each array of `StepOutput` for B worlds of a game, by name.
+
+    Axes of entries that the game lacks have length 0, see `StepOutput`.
+    """
+    agents = game.agents
+    return forms_of(
+        StepOutput,
+        **dict(zip("CXY", game.observation_shape, strict=True)),
+        B=worlds,
+        N=agents,
+        P=int(bool(game.map.river)),
+        M=agents * bool(game.map.river),
+        L=agents * bool(game.institutions),
+        V=len(game.ballots),
+        U=int(paints_over(game.rules.quirks)),
+        counts=len(COUNT_NAMES),
+    )

@@ -1,10 +1,10 @@
-"""Headings, and the step to the next cell ahead."""
+"""The four headings of agents, and the step from a cell to the next one ahead."""
 
 from typing import Final
 
-UP, RIGHT, DOWN, LEFT = 0, 1, 2, 3
-"""Headings; adding one turns right by 90 degrees."""
+UP, RIGHT, DOWN, LEFT = range(4)
+"""The headings in clockwise order: adding 1 modulo 4 turns right by 90 degrees."""
 
 ROW_STEP: Final = (-1, 0, 1, 0)
 COL_STEP: Final = (0, 1, 0, -1)
-"""The step to the next cell ahead, indexed by heading."""
+"""The change of row and of column from a cell to the next one ahead, by heading."""

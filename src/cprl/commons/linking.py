@@ -1,9 +1,10 @@
-"""Rules as parts of one piece of machine code, which LLVM optimises once.
+"""Link all rules to one piece of machine code, which LLVM optimises only once.
 
-Numba optimises each function with all that it calls, and makes machine code of it, so that a rule that is
-called by rules that are called by others is compiled again in each of them: that took half of the time.
+By default Numba optimises each function together with all functions that it calls, and makes machine code of
+it. So a rule is compiled again for every function that calls it, directly or through others, which took half
+of the time to compile. Here the rules stay parts without machine code, and only the entry is compiled.
 
-Private parts of Numba: the libraries of its code generator, and how its compiler makes them.
+This uses private parts of Numba: the libraries of its code generator, and the steps of its compiler.
 """
 
 from typing import Any, Final
@@ -17,7 +18,7 @@ with relying_on("numba", "numba._dynfunc, JITCodeLibrary and Compiler"):
 
 
 class _Part(JITCodeLibrary):
-    """The code of a function that is called by others alone: not linked, and no machine code."""
+    """The library of a function that only compiled functions call: neither linked nor made machine code."""
 
     def finalize(self) -> None:
         self._raise_if_finalized()
@@ -27,14 +28,17 @@ class _Part(JITCodeLibrary):
         return 0
 
     def _get_module_for_linking(self) -> Any:
-        """Return the code as it is: what Numba marks as "linkonce" LLVM leaves out where it is linked before
-        that which calls it."""
+        """Return the module of the code unchanged.
+
+        Numba would mark its functions as "linkonce", and LLVM leaves such functions out if they are linked
+        before the functions that call them.
+        """
         self._ensure_finalized()
         return self._final_module
 
 
 class _Whole(JITCodeLibrary):
-    """The code of a function with that of all the parts that it calls, at whatever depth."""
+    """The library of an entry, with all parts that it calls directly or through others."""
 
     def finalize(self) -> None:
         libraries: dict[Any, None] = {}
@@ -45,7 +49,7 @@ class _Whole(JITCodeLibrary):
                 libraries[library] = None
                 if isinstance(library, _Part):
                     waiting += library._linking_libraries
-        # Parts first, so that what they call, "linkonce", is linked.
+        # Parts come first, so that the "linkonce" functions that they call are linked.
         self._linking_libraries = sorted(libraries, key=lambda library: not isinstance(library, _Part))
         super().finalize()
 
@@ -58,7 +62,7 @@ class _Whole(JITCodeLibrary):
 
 
 class _ToWhole(Compiler):
-    """Numba's compiler, for an entry."""
+    """Numba's compiler for an entry."""
 
     library: Any = _Whole
 
@@ -70,20 +74,23 @@ class _ToWhole(Compiler):
 
 
 class _ToPart(_ToWhole):
-    """Numba's compiler, for what an entry calls."""
+    """Numba's compiler for the rules that an entry calls."""
 
     library = _Part
 
     def _compile_core(self) -> Any:
         self.state.flags.no_compile = True
-        made = super()._compile_core()
-        form, library = made.fndesc, self.state.library
+        result = super()._compile_core()
+        library = self.state.library
         library._ensure_finalized()
-        key = _dynfunc.make_function(form.lookup_module(), form.qualname, "", 0, made.environment, (library,))
-        self.state.targetctx.insert_user_function(key, form, [library])
-        return made._replace(entry_point=key)
+        function = result.fndesc
+        key = _dynfunc.make_function(
+            function.lookup_module(), function.qualname, "", 0, result.environment, (library,)
+        )
+        self.state.targetctx.insert_user_function(key, function, [library])
+        return result._replace(entry_point=key)
 
 
 AS_WHOLE: Final = {"pipeline_class": _ToWhole}
 AS_PART: Final = {"pipeline_class": _ToPart}
-"""Options of `numba.njit`, of an entry and of what it calls. A part can be called by compiled code alone."""
+"""Options of `numba.njit` for an entry, and for the rules it calls. Only compiled code can call a part."""

@@ -1,7 +1,7 @@
-"""Commons of the literature as games, each with its source; `docs/games.md` has what differs from them.
+"""Games of the literature by name, each with its source; `docs/games.md` lists what differs from the sources.
 
-An id never changes its meaning: other rules are another version. Layouts and numbers are facts of their
-sources, the rules that play them are ours.
+A name never changes its meaning: a game with other rules gets another version. Layouts and numbers come from
+the sources, and cprl's own rules play them.
 """
 
 from collections.abc import Callable, Mapping
@@ -187,7 +187,8 @@ _PEROLAT: Final[dict[str, Any]] = {
     "window_rows": 20,
     "window_columns": 21,
 }
-_JANSSEN: Final[dict[str, Any]] = {  # a turn is the eighth of a second that a move of a person takes
+# A turn is an eighth of a second, the time that a person takes for a move in the laboratory.
+_JANSSEN: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.01 / 8),
     "regrow_by": "share",
     "regrow_radius_cells": 1,
@@ -202,29 +203,31 @@ _JANSSEN: Final[dict[str, Any]] = {  # a turn is the eighth of a second that a m
 
 
 class Source(NamedTuple):
-    """What a game of the literature is after."""
+    """A game of the literature: where it comes from, and the board and rules from which it is made."""
 
     work: str
     """Authors, title and year, or the name of a program."""
     url: str
     board: Callable[[Any], "Map"]
-    """Makes it with `cprl.commons.maps`, which is imported when a game is made."""
+    """A function that makes the board. Its argument is the module `cprl.commons.maps`, which is only imported
+    when a game is made."""
     rules: Mapping[str, Any]
-    """What differs from the defaults of `Rules`."""
+    """The fields of `Rules` that differ from their defaults."""
     fines: Mapping[str, Any] | None = None
-    """The numbers of `Punishment`; None without fines."""
+    """The fields of the game's `Punishment`; None for a game without fines."""
     sees_all: bool = False
     """Whether agents observe the whole board."""
 
 
 def _open_field(maps: Any) -> "Map":
-    """Return a board of the size and number of sites of Perolat's open map, at places of our own."""
+    """Return a board with the size and the number of sites of Perolat's open map, but with sites drawn by
+    chance."""
     board: Map = maps.random(20, 40, agents=12, density=246 / 800, clustering=0.8, seed=1)
     return board
 
 
-def _lab(maps: Any) -> "Map":
-    """Every cell is a site; people begin in the middle row."""
+def _laboratory(maps: Any) -> "Map":
+    """Return the board of Janssen's experiment: every cell is a site, and agents start in the middle row."""
     cells = tuple((row, col) for row in range(29) for col in range(29))
     starts = tuple((14, 4 + 5 * i, maps.UP) for i in range(5))
     board: Map = maps.Map(height=29, width=29, sites=cells, starts=starts)
@@ -232,7 +235,7 @@ def _lab(maps: Any) -> "Map":
 
 
 def _without_walls(drawing: str) -> str:
-    """Return a drawing without the ring of walls around it."""
+    """Return a drawing without its outermost rows and columns, which are walls."""
     return "\n".join(line[1:-1] for line in drawing.strip("\n").splitlines()[1:-1])
 
 
@@ -246,6 +249,7 @@ _PEROLAT_SOURCE: Final = (
 
 
 def _melting_pot(name: str, drawing: str, rules: Mapping[str, Any]) -> Source:
+    """Return the source of a game of Melting Pot, by the last part of its name there."""
     return Source(
         f"Melting Pot 2.4, commons_harvest__{name}",
         "https://github.com/google-deepmind/meltingpot",
@@ -289,29 +293,31 @@ SOURCES: Final[dict[str, Source]] = {
         "M. A. Janssen, R. Holahan, A. Lee and E. Ostrom, Lab experiments for the study of social-ecological "
         "systems, Science 328, 2010",
         "https://doi.org/10.1126/science.1183532",
-        _lab,
+        _laboratory,
         _JANSSEN,
         {"fine": 2.0, "cost": 1.0},
         sees_all=True,
     ),
 }
-"""Every game by its id."""
+"""All games of the literature, by name."""
 
 
-def game(name: str) -> "Game":
-    """Return a game of the literature, by one of the ids of `SOURCES`."""
+def game_of_literature(name: str) -> "Game":
+    """Return a game of the literature by its name, one of `SOURCES`."""
     from cprl.commons import maps
     from cprl.commons.game import Game
-    from cprl.commons.observation import Observation
+    from cprl.commons.observation import Area, Observation
     from cprl.commons.river import River
     from cprl.commons.rules import RandomEnd, Rules
     from cprl.institutions import Punishment
 
-    source, kinds = SOURCES[name], {"river": River, "random_end": RandomEnd}
-    groups = {group: kind(**source.rules[group]) for group, kind in kinds.items() if group in source.rules}
+    source = SOURCES[name]
+    rules = dict(source.rules)
+    for group, kind in {"river": River, "random_end": RandomEnd}.items():
+        if group in rules:
+            rules[group] = kind(**rules[group])
+    fines = (Punishment(**source.fines),) if source.fines else ()
+    area: Area = "full" if source.sees_all else "window"
     return Game(
-        map=source.board(maps),
-        rules=Rules(**{**source.rules, **groups}),
-        observation=Observation(area="full" if source.sees_all else "window"),
-        institutions=(Punishment(**source.fines),) if source.fines else (),
+        map=source.board(maps), rules=Rules(**rules), observation=Observation(area=area), institutions=fines
     )

@@ -1,6 +1,7 @@
-"""The loops over worlds that a thread runs, on the CPU or the GPU. Each rule works on one world.
+"""The loops over worlds that each thread runs, on the CPU or the GPU; drivers call these compiled functions.
 
-Playing, beginning and refreshing are tasks of one loop, so that what they share is compiled once.
+The loops cut one world out of the arrays of all worlds and pass it to the rules. To play a turn, to begin an
+episode and to refresh the output are tasks of one loop, so that the code that they share is compiled once.
 """
 
 from typing import Final, NamedTuple
@@ -11,14 +12,16 @@ from cprl.commons.views import draw_board
 from cprl.commons.world import Scratch, StepOutput, Worlds
 from cprl.institutions import Law
 from cprl.institutions.arrays import slicer
-from cprl.values.arrays import Bool, Int64, UInt8
+from cprl.values.array_types import Bool, Int64, UInt8
 
-one_world, one_output, one_law = slicer(Worlds), slicer(StepOutput), slicer(Law)
+one_world = slicer(Worlds)
+one_output = slicer(StepOutput)
+one_law = slicer(Law)
 one_scratch = slicer(Scratch, every=True)
 
 
 class Played(NamedTuple):
-    """What `run_worlds` works on."""
+    """The arrays of all B worlds on which `run_worlds` works."""
 
     worlds: Worlds
     tables: Tables
@@ -29,33 +32,36 @@ class Played(NamedTuple):
     """int64 [B, N]"""
     decisions: Int64
     """int64 [B, N]"""
-    which: Bool
-    """bool [B], the worlds that the task is done with."""
+    selected: Bool
+    """bool [B], True for worlds with which the task is done."""
 
 
 def run_worlds(game: Played, task: int, scratch: Scratch, first: int, last: int) -> None:
-    """Do a task with those of the worlds first .. last - 1 that `game.which` names; see `run_world`."""
+    """Do a task with the selected worlds among first .. last - 1; see `run_world` for the tasks."""
     for b in range(first, last):
-        if game.which[b]:
-            world, output, law = one_world(game.worlds, b), one_output(game.output, b), one_law(game.law, b)
+        if game.selected[b]:
+            world = one_world(game.worlds, b)
+            output = one_output(game.output, b)
+            law = one_law(game.law, b)
             run_world(world, game.tables, task, game.actions[b], game.decisions[b], output, law, scratch)
 
 
 def show_worlds(game: tuple[Worlds, Tables, UInt8], scratch: Scratch, first: int, last: int) -> None:
-    """Draw the boards of the worlds first .. last - 1, uint8 [B, H, W], classes of cells."""
+    """Draw the boards of the worlds first .. last - 1 into the last entry of `game`, uint8 [B, H, W], as
+    classes of cells."""
     worlds, tables, boards = game
     for b in range(first, last):
         draw_board(one_world(worlds, b), tables, scratch, boards[b])
 
 
-def first_unknown(actions: Int64, known: int) -> int:
-    """Return the index of the first action outside 0 .. known - 1, -1 if there is none; `actions`: int64
-    [count]."""
+def first_invalid(actions: Int64, known: int) -> int:
+    """Return the index of the first action outside 0 .. known - 1, or -1 if all are known; `actions`: int64,
+    one axis."""
     for n in range(actions.shape[0]):
         if actions[n] < 0 or actions[n] >= known:
             return n
     return -1
 
 
-ENTRIES: Final = (run_worlds, show_worlds, first_unknown)
-"""What drivers call; all other rules are called by these."""
+ENTRIES: Final = (run_worlds, show_worlds, first_invalid)
+"""The functions that drivers call; these call all rules."""

@@ -1,17 +1,15 @@
-"""Boards: a Map is drawn (`parse`, `read`), known by name (`named`), or generated (`crosses`, `rooms`,
+"""Boards: draw a Map (`parse`, `read_file`), name one (`published`), or generate one (`crosses`, `rooms`,
 `random`).
 
-A drawing is rows of signs: `A` an apple site, `.` open ground, `#` an inner wall, `P` a spawn place, `~` and
-`H` a river's water and waste, `> ^ < v` an agent with its heading. Drawings of others are read by their own
-signs, see `LEGENDS`. Everything outside the board is wall.
+A drawing has one line per row and one sign per cell: `A` is an apple site, `.` open ground, `#` an inner
+wall, `P` a spawn place, `~` a river's water, `H` its waste, and `> ^ < v` an agent with its heading. Drawings
+of other libraries are read by their own signs, see `LEGENDS`. All cells outside the board are wall.
 """
 
-from bisect import bisect_left, insort
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from importlib import import_module
 from inspect import cleandoc
-from math import isqrt
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -19,50 +17,51 @@ import numpy as np
 
 from cprl.commons.headings import DOWN, LEFT, RIGHT, UP
 from cprl.values import Natural, PositiveShare, Range, Seed, Share, Value, Where, checked, refusal
-from cprl.values.arrays import Bool
+from cprl.values.array_types import Bool
 
 Cell = tuple[int, int]
+"""(row, col), counted from 0 at the top left."""
 Start = tuple[int, int, int]
-
-SIGN_OF_HEADING: Final = {UP: "^", RIGHT: ">", DOWN: "v", LEFT: "<"}
-HEADING_OF_SIGN: Final = {sign: heading for heading, sign in SIGN_OF_HEADING.items()}
-SITE, GROUND, WALL, SPAWN, WATER, WASTE = "A", ".", "#", "P", "~", "H"
+"""(row, col, heading) where an agent begins; headings as in `cprl.commons.headings`."""
 
 Meaning = Literal["site", "ground", "wall", "spawn", "water", "waste", "up", "right", "down", "left"]
-"""What a sign stands for: a cell, of the river with or without waste, or an agent's start with its
-heading."""
-_HEADINGS: Final = {"up": UP, "right": RIGHT, "down": DOWN, "left": LEFT}
-_SPACES: Final[dict[str, Meaning]] = {"A": "site", " ": "ground", "P": "spawn"}
-LEGENDS: Final[dict[str, dict[str, Meaning]]] = {
-    "cprl": {
-        **{SITE: "site", GROUND: "ground", WALL: "wall", SPAWN: "spawn", WATER: "water", WASTE: "waste"},
-        **{"^": "up", ">": "right", "v": "down", "<": "left"},
-    },
-    "melting_pot": {**_SPACES, "W": "wall", "Q": "up", "I": "ground"},
-    "ssd": {**_SPACES, "@": "wall"},
-    "ssd_cleanup": {**_SPACES, "@": "wall", "B": "site", "S": "ground", "R": "water", "H": "waste"},
-    "socialjax": {**_SPACES, "W": "wall", "Q": "up"},
+"""The meaning of a sign: a kind of cell, or an agent's start with its heading. "water" and "waste" are cells
+of a river without and with waste."""
+SIGN_OF: Final[dict[Meaning, str]] = {
+    **{"site": "A", "ground": ".", "wall": "#", "spawn": "P", "water": "~", "waste": "H"},
+    **{"up": "^", "right": ">", "down": "v", "left": "<"},
 }
-"""The signs of drawings by name: our own; Melting Pot's commons_harvest, whose tiles `I` of hidden rewards
-are ground here; sequential_social_dilemma_games' harvest, and its cleanup, whose stream `S` is ground here;
-SocialJax' harvest."""
+_HEADINGS: Final[dict[Meaning, int]] = {"up": UP, "right": RIGHT, "down": DOWN, "left": LEFT}
+SIGN_OF_HEADING: Final = {heading: SIGN_OF[name] for name, heading in _HEADINGS.items()}
+_SHARED_SIGNS: Final[dict[str, Meaning]] = {"A": "site", " ": "ground", "P": "spawn"}
+"""The signs that drawings of all other libraries share."""
+LEGENDS: Final[dict[str, dict[str, Meaning]]] = {
+    "cprl": {sign: meaning for meaning, sign in SIGN_OF.items()},
+    "melting_pot": {**_SHARED_SIGNS, "W": "wall", "Q": "up", "I": "ground"},
+    "ssd": {**_SHARED_SIGNS, "@": "wall"},
+    "ssd_cleanup": {**_SHARED_SIGNS, "@": "wall", "B": "site", "S": "ground", "R": "water", "H": "waste"},
+    "socialjax": {**_SHARED_SIGNS, "W": "wall", "Q": "up"},
+}
+"""The signs of drawings, by name: those of cprl; of Melting Pot's commons_harvest, whose tiles `I` of hidden
+rewards are ground here; of harvest and of cleanup in sequential_social_dilemma_games, where the stream `S` is
+ground here; and of SocialJax' harvest."""
 
 LONGEST_SIDE_CELLS: Final = 10_000
 LARGEST_BOARD_CELLS: Final = 2**20
-"""The largest number of cells: on a board this large, tables and working memory take some 100 MB."""
+"""The largest number of cells. Tables and working memory of such a board take some 100 MB."""
 Side = Annotated[int, Range(1, LONGEST_SIDE_CELLS)]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Map(Value):
-    """A board with its walls, its apple sites and the starts of the agents. Every cell outside it is wall."""
+    """A board: its size, walls and apple sites, and where agents start. All cells outside it are wall."""
 
     height: Side
     """The number of rows H; H x W is at most 2**20."""
     width: Side
     """The number of columns W."""
     sites: Annotated[tuple[Cell, ...], Where(lambda sites: len(sites) > 0, "at least one (row, column)")]
-    """(row, col) of each of the K sites, the cells that can hold an apple; all do when an episode begins."""
+    """(row, col) of each of the K sites, the cells that can hold an apple."""
     starts: Annotated[
         tuple[Start, ...],
         Where(
@@ -70,16 +69,17 @@ class Map(Value):
             "at least one (row, column, heading), each heading 0 to 3",
         ),
     ]
-    """(row, col, heading) of each of the N agents, agent 0 first; heading 0 up, 1 right, 2 down, 3 left."""
+    """(row, col, heading) where each of the N agents starts, agent 0 first; heading 0 is up, 1 right, 2 down,
+    3 left."""
     walls: tuple[Cell, ...] = ()
     """(row, col) of each inner wall."""
     spawns: tuple[Cell, ...] = ()
-    """(row, col) of each spawn place: agents whose start is one of them begin each episode at another one,
-    drawn by chance, no two at the same; agents with another start begin there."""
+    """(row, col) of each spawn place. An agent whose start is a spawn place begins each episode at a spawn
+    place drawn by chance, no two agents at the same; all other agents begin at their starts."""
 
     river: tuple[Cell, ...] = ()
-    """(row, col) of each of the R cells of a river, which can have waste, see `Rules.pollution_prob`; agents
-    walk over them."""
+    """(row, col) of each of the R cells of a river, which can have waste, see `cprl.commons.river.River`.
+    Agents can walk over them."""
     waste: tuple[Natural, ...] = ()
     """The indices of the river's cells that have waste when an episode begins."""
 
@@ -89,7 +89,7 @@ class Map(Value):
             raise refusal("Map.waste", self.waste, f"indices of Map.river, which has {len(self.river)} cells")
         if len(set(self.waste)) < len(self.waste):
             raise refusal("Map.waste", self.waste, "each cell once")
-        check_cells("Map", self.height, self.width)
+        check_board_size("Map", self.height, self.width)
         _check_cells(self)
 
     def __repr__(self) -> str:
@@ -101,27 +101,30 @@ class Map(Value):
 
     @property
     def agents(self) -> int:
-        """The number of agents N."""
+        """Return the number of agents N."""
         return len(self.starts)
 
     def drawing(self) -> str:
-        """Return the board as a drawing for `parse`. An agent hides a site or spawn place on its cell; its
-        index is not shown."""
-        signs = [[GROUND] * self.width for _ in range(self.height)]
+        """Return the board as a drawing, which `parse` can read.
+
+        An agent hides a site or spawn place on its cell, and its index is not shown.
+        """
+        signs = [[SIGN_OF["ground"]] * self.width for _ in range(self.height)]
         for row, col in self.sites:
-            signs[row][col] = SITE
+            signs[row][col] = SIGN_OF["site"]
         for row, col in self.spawns:
-            signs[row][col] = SPAWN
+            signs[row][col] = SIGN_OF["spawn"]
         for index, (row, col) in enumerate(self.river):
-            signs[row][col] = WASTE if index in self.waste else WATER
+            signs[row][col] = SIGN_OF["waste"] if index in self.waste else SIGN_OF["water"]
         for row, col in self.walls:
-            signs[row][col] = WALL
+            signs[row][col] = SIGN_OF["wall"]
         for row, col, heading in self.starts:
             signs[row][col] = SIGN_OF_HEADING[heading]
         return "\n".join("".join(row) for row in signs)
 
 
-def check_cells(name: str, height: int, width: int) -> None:
+def check_board_size(name: str, height: int, width: int) -> None:
+    """Refuse a board with too many cells; `name` stands for the board in the message."""
     if height * width > LARGEST_BOARD_CELLS:
         raise ValueError(
             f"{name} has {height:,} x {width:,} = {height * width:,} cells; allowed: at most "
@@ -130,78 +133,105 @@ def check_cells(name: str, height: int, width: int) -> None:
 
 
 def _check_cells(board: Map) -> None:
-    """Raise a ValueError for a cell outside the board, on a wall, or named twice, and a site on a river."""
-    walls, river = set(board.walls), set(board.river)
-    starts = [(row, col) for row, col, _ in board.starts]
-    kinds = {
+    """Raise a ValueError for a cell that is outside the board, on a wall or listed twice, or a site on a
+    river."""
+    cells_by_kind = {
         "site": board.sites,
-        "start": starts,
+        "start": [(row, col) for row, col, _ in board.starts],
         "spawn place": board.spawns,
         "river": board.river,
         "wall": board.walls,
     }
-    for name, cells in kinds.items():
-        seen: set[Cell] = set()
-        for row, col in cells:
-            problem = ""
-            if not (0 <= row < board.height and 0 <= col < board.width):
-                problem = (
-                    f"lies outside the board of {board.height} rows and {board.width} columns; allowed: rows "
-                    f"0 to {board.height - 1}, columns 0 to {board.width - 1}"
-                )
-            elif (row, col) in seen:
-                problem = "is there twice; allowed: one per cell"
-            elif name != "wall" and (row, col) in walls:
-                problem = "is on a wall; allowed: open ground"
-            elif name == "site" and (row, col) in river:
-                problem = "is on the river; allowed: ground"
+    walls = set(board.walls)
+    river = set(board.river)
+    for kind, cells in cells_by_kind.items():
+        earlier_cells: set[Cell] = set()
+        for cell in cells:
+            problem = _cell_problem(board, kind, cell, earlier_cells, walls, river)
             if problem:
-                raise ValueError(f"the {name} at row {row}, column {col} {problem}")
-            seen.add((row, col))
+                raise ValueError(f"the {kind} at row {cell[0]}, column {cell[1]} {problem}")
+            earlier_cells.add(cell)
+
+
+def _cell_problem(
+    board: Map, kind: str, cell: Cell, earlier_cells: set[Cell], walls: set[Cell], river: set[Cell]
+) -> str:
+    """Return why a site, start, wall or the like cannot be on a cell, and what is allowed; "" if it can.
+
+    `earlier_cells`: the cells before it of the same kind. `walls` and `river`: those of the board, as sets,
+    since tuples are slow to search.
+    """
+    row, col = cell
+    if not (0 <= row < board.height and 0 <= col < board.width):
+        return (
+            f"lies outside the board of {board.height} rows and {board.width} columns; allowed: rows "
+            f"0 to {board.height - 1}, columns 0 to {board.width - 1}"
+        )
+    if cell in earlier_cells:
+        return "is there twice; allowed: one per cell"
+    if kind != "wall" and cell in walls:
+        return "is on a wall; allowed: open ground"
+    if kind == "site" and cell in river:
+        return "is on the river; allowed: ground"
+    return ""
 
 
 def parse(drawing: str, *, legend: str | Mapping[str, Meaning] = "cprl", agents: int | None = None) -> Map:
-    """Read a drawing of any size.
+    """Read a map from a drawing, see the top of this module; `parse("A.\\n>.")` has one site and one agent.
 
-    Agents are numbered in reading order, rows and columns from 0; agents that are not drawn start at spawn
-    places, in reading order, and look up. Empty lines around the drawing are ignored, and common indentation
-    is if no sign is a space.
+    Agents are numbered in reading order. Agents that are not drawn start at spawn places, in reading order,
+    and head up. Empty lines around the drawing are ignored; so is common indentation, unless a space is one
+    of the signs.
 
     Args:
-        legend: one of `LEGENDS`, or what each sign means.
+        drawing: the drawing, of any size.
+        legend: the meaning of each sign, or the name of a legend in `LEGENDS`.
         agents: the number of agents N; None for as many as are drawn.
+
+    Raises:
+        ValueError: for unknown signs, rows of different lengths, or a board that `Map` refuses.
     """
     signs = LEGENDS[checked("legend", legend, Literal[tuple(LEGENDS)])] if isinstance(legend, str) else legend
     for sign, meaning in signs.items():
         checked(f"legend[{sign!r}]", meaning, Meaning)
     rows = _rows(drawing, signs)
-    cells = [(r, c, signs[sign]) for r, row in enumerate(rows) for c, sign in enumerate(row)]
-
-    def places(kind: Meaning) -> tuple[Cell, ...]:
-        return tuple((r, c) for r, c, meaning in cells if meaning == kind)
-
-    starts = [(r, c, _HEADINGS[meaning]) for r, c, meaning in cells if meaning in _HEADINGS]
-    spawns, drawn = places("spawn"), len(starts)
-    river = [cell for cell in cells if cell[2] in ("water", "waste")]
-    if agents is None and not starts and spawns:
-        raise refusal("agents", agents, f"1 to {len(spawns)}: the drawing has spawn places, and no agent")
-    if agents is not None:
-        starts += [(*spawn, UP) for spawn in spawns]
-        starts = starts[: checked("agents", agents, Annotated[int, Range(1, max(1, drawn + len(spawns)))])]
+    meanings = {(row, col): signs[sign] for row, line in enumerate(rows) for col, sign in enumerate(line)}
+    drawn_starts = [(*cell, _HEADINGS[meaning]) for cell, meaning in meanings.items() if meaning in _HEADINGS]
+    spawns = _cells_with(meanings, "spawn")
+    river = _cells_with(meanings, "water", "waste")
     return Map(
         height=len(rows),
         width=len(rows[0]),
-        sites=places("site"),
-        starts=tuple(starts),
-        walls=places("wall"),
+        sites=_cells_with(meanings, "site"),
+        starts=_starts_of_agents(drawn_starts, spawns, agents),
+        walls=_cells_with(meanings, "wall"),
         spawns=spawns,
-        river=tuple((r, c) for r, c, meaning in river),
-        waste=tuple(index for index, (*_, meaning) in enumerate(river) if meaning == "waste"),
+        river=river,
+        waste=tuple(index for index, cell in enumerate(river) if meanings[cell] == "waste"),
     )
 
 
-def read(path: str | Path, *, legend: str | Mapping[str, Meaning] = "cprl", agents: int | None = None) -> Map:
-    """Read a drawing from a file in UTF-8, see `parse`."""
+def _cells_with(meanings: Mapping[Cell, Meaning], *wanted: Meaning) -> tuple[Cell, ...]:
+    """Return the cells of a drawing that have one of these meanings, in reading order."""
+    return tuple(cell for cell, meaning in meanings.items() if meaning in wanted)
+
+
+def _starts_of_agents(
+    drawn_starts: list[Start], spawns: tuple[Cell, ...], agents: int | None
+) -> tuple[Start, ...]:
+    """Return the starts of N agents: first the drawn ones, then spawn places, where agents head up."""
+    if agents is None and not drawn_starts and spawns:
+        raise refusal("agents", agents, f"1 to {len(spawns)}: the drawing has spawn places, and no agent")
+    if agents is None:
+        return tuple(drawn_starts)
+    starts = [*drawn_starts, *((*spawn, UP) for spawn in spawns)]
+    return tuple(starts[: checked("agents", agents, Annotated[int, Range(1, max(1, len(starts)))])])
+
+
+def read_file(
+    path: str | Path, *, legend: str | Mapping[str, Meaning] = "cprl", agents: int | None = None
+) -> Map:
+    """Read a map from a file with a drawing, in UTF-8; arguments and errors are those of `parse`."""
     if Path(path).stat().st_size > _LARGEST_DRAWING_BYTES:
         raise ValueError(f"{path} has more than {_LARGEST_DRAWING_BYTES:,} bytes; allowed: a drawing")
     try:
@@ -214,25 +244,25 @@ _LARGEST_DRAWING_BYTES: Final = 10_000_000
 
 
 def _rows(drawing: str, signs: Mapping[str, Meaning]) -> list[str]:
-    """Return the rows of a drawing, all of them of the same length."""
+    """Return the rows of a drawing, all of the same length; raise a ValueError for an unknown sign."""
     if " " in signs:
         lines = drawing.splitlines()
-        full = [number for number, line in enumerate(lines) if line.strip()]
-        lines = lines[full[0] : full[-1] + 1] if full else []
+        filled = [number for number, line in enumerate(lines) if line.strip()]
+        lines = lines[filled[0] : filled[-1] + 1] if filled else []
         width = max(map(len, lines), default=0)
         rows = [line.ljust(width) for line in lines]
     else:
         rows = [row.rstrip() for row in cleandoc(drawing).splitlines()]
     if not rows:
         raise ValueError("the drawing is empty; allowed: at least one row of signs")
-    for r, row in enumerate(rows):
-        for c, sign in enumerate(row):
+    for row, line in enumerate(rows):
+        for col, sign in enumerate(line):
             if sign not in signs:
-                known = " ".join("space" if known == " " else known for known in signs)
-                raise ValueError(f"unknown sign {sign!r} at row {r}, column {c}; allowed: {known}")
-        if len(row) != len(rows[0]):
+                allowed = " ".join("space" if known == " " else known for known in signs)
+                raise ValueError(f"unknown sign {sign!r} at row {row}, column {col}; allowed: {allowed}")
+        if len(line) != len(rows[0]):
             raise ValueError(
-                f"row {r} ends after column {len(row) - 1}, row 0 after column {len(rows[0]) - 1}; "
+                f"row {row} ends after column {len(line) - 1}, row 0 after column {len(rows[0]) - 1}; "
                 "all rows of a drawing must have the same length"
             )
     return rows
@@ -285,14 +315,14 @@ _DRAWINGS: Final = {
 _NUMBERED_STARTS: Final[dict[str, tuple[Start, ...]]] = {
     "commons": ((0, 1, RIGHT), (2, 2, DOWN), (1, 3, DOWN), (0, 2, RIGHT))
 }
-"""Starts of boards on which the published program does not number its agents in reading order."""
+"""The starts on boards where the published program does not number its agents in reading order."""
 
 NAMES: Final = tuple(_DRAWINGS)
-"""The four published boards, after [W]."""
+"""The names of the four boards that Wiatrak (2019) published."""
 
 
-def named(name: str) -> Map:
-    """Return a published board, by its name in `NAMES`."""
+def published(name: str) -> Map:
+    """Return a published board by its name, one of `NAMES`."""
     checked("name", name, Literal[NAMES])
     board = parse(_DRAWINGS[name])
     starts = _NUMBERED_STARTS.get(name, board.starts)
@@ -300,29 +330,32 @@ def named(name: str) -> Map:
 
 
 def with_agents(board: Map, agents: int) -> Map:
-    """Return a board with its first starts, or with more of them: at spawn places, in their order, and then
-    on the free ground nearest to the first start.
+    """Return the board with starts for another number of agents.
 
-    Further agents look the way of the last one. Ground is free where no wall, site, spawn place or start is;
-    of two cells equally near, the one that is read first comes first.
+    For fewer agents the first starts are kept. Further agents start at the free spawn places, in their order,
+    and then on the free ground nearest to the first start, with the heading of the last start. Ground is free
+    where no wall, site, spawn place or start is; among cells equally near, reading order decides.
     """
     checked("agents", agents, Annotated[int, Range(1, LARGEST_BOARD_CELLS)])
-    begun = {(row, col) for row, col, _ in board.starts}
-    taken = {*board.sites, *board.walls, *board.spawns, *begun}
+    start_cells = {(row, col) for row, col, _ in board.starts}
+    taken = {*board.sites, *board.walls, *board.spawns, *start_cells}
     cells = [(row, col) for row in range(board.height) for col in range(board.width)]
-    top, left, _ = board.starts[0]
-    free = [cell for cell in cells if cell not in taken]
-    free.sort(key=lambda cell: abs(cell[0] - top) + abs(cell[1] - left))
-    free = [*(spawn for spawn in board.spawns if spawn not in begun), *free]
-    if agents > board.agents + len(free):
-        allowed = f"at most {board.agents + len(free)} on this board, whose other cells are walls and sites"
+    first_row, first_col, _ = board.starts[0]
+    free_ground = [cell for cell in cells if cell not in taken]
+    free_ground.sort(key=lambda cell: abs(cell[0] - first_row) + abs(cell[1] - first_col))
+    free_spawns = [spawn for spawn in board.spawns if spawn not in start_cells]
+    free_cells = [*free_spawns, *free_ground]
+    most_agents = board.agents + len(free_cells)
+    if agents > most_agents:
+        allowed = f"at most {most_agents} on this board, whose other cells are walls and sites"
         raise refusal("agents", agents, allowed)
     heading = board.starts[-1][2]
-    further = [(row, col, heading) for row, col in free[: max(0, agents - board.agents)]]
-    return replace(board, starts=(*board.starts[:agents], *further))
+    added = [(row, col, heading) for row, col in free_cells[: max(0, agents - board.agents)]]
+    return replace(board, starts=(*board.starts[:agents], *added))
 
 
 Entrances = Literal["single", "multiple", "none", "unequal"]
+"""The kinds of entrances that the rooms of `rooms` can have."""
 
 _ROOMS: Final = """
     ..A....A....A....A....A.#...#.A....A....A....A....A..
@@ -345,7 +378,7 @@ _ROOMS: Final = """
     .AAA..AAA..AAA..AAA..AAA#...oAAA..AAA..AAA..AAA..AAA.
     ..A....A....A....A....A.#...#.A....A....A....A....A..
 """
-"""The board of `rooms`; "o" is a wall, but open under "multiple"."""
+"""The drawing of `rooms`, with walls at "o" that are open ground under "multiple"."""
 
 _CLOSE_ROOM: Final = """
     ..A...A...A...A...A.....
@@ -356,23 +389,29 @@ _CLOSE_ROOM: Final = """
     ......................#.
     ......................#.
 """
-"""The north-west room under "unequal"."""
+"""The drawing of the north-west room under "unequal"."""
 
 ROOM_NAMES: Final = ("north-west", "north-east", "south-east", "south-west")
 _ROOM_SLICES: Final = tuple(
     (slice(*rows), slice(*columns))
     for rows, columns in (((0, 7), (0, 24)), ((0, 7), (29, 53)), ((12, 19), (29, 53)), ((12, 19), (0, 24)))
 )
-"""Rows and columns of each room; all else is corridor or wall."""
+"""The rows and columns of each room, in the order of `ROOM_NAMES`; all other cells are corridor or wall."""
+_ROOM_STARTS: Final = (0, 5, 11, 6, 1, 4, 10, 7, 2, 3, 9, 8)
+"""For each agent the index of its start in `_ROOMS`, in reading order: agents fill the rooms in turn."""
 
 
 def crosses(
     *, height: int, width: int, centres: Iterable[Cell], starts: Iterable[Start], walls: Iterable[Cell] = ()
 ) -> Map:
-    """Return a board whose sites form crosses: each centre and its four neighbours.
+    """Return a board whose sites form crosses, each of a centre and its four neighbours.
 
     Args:
+        height: the number of rows.
+        width: the number of columns.
         centres: (row, col) of the centre of each cross; a cell in two crosses is one site.
+        starts: (row, col, heading) where each agent starts.
+        walls: (row, col) of each inner wall.
     """
     sites = {
         (row + down, col + right)
@@ -385,31 +424,36 @@ def crosses(
 
 
 def rooms(entrances: Entrances = "single", *, agents: int = 12) -> Map:
-    """Four rooms around a plus-shaped corridor, 19 x 53, after Perolat et al. (2017).
+    """Return a board of four rooms around a plus-shaped corridor, 19 x 53, after Perolat et al. (2017).
 
-    There are 36 crosses with 180 sites. "single" gives each room one entrance with a bend, "multiple"
-    several; "none" removes all walls; "unequal" is "single" with the crosses of the north-west room closer
-    together.
-    The starts are ours: up to three agents per room, assigned in turn to the north-west, north-east,
-    south-east and south-west room.
+    It has 36 crosses with 180 sites. The starts are chosen by cprl: up to three agents per room, assigned in
+    turn to the north-west, north-east, south-east and south-west room.
+
+    Args:
+        entrances: "single" gives each room one entrance with a bend, "multiple" several, and "none" removes
+            all walls. "unequal" is "single" with the crosses of the north-west room closer together.
+        agents: the number of agents, at most 12.
     """
     checked("entrances", entrances, Entrances)
     agents = checked("agents", agents, Annotated[int, Range(1, 12)])
     rows = _ROOMS.split()
     if entrances == "unequal":
-        close = _CLOSE_ROOM.split()
-        rows[: len(close)] = [west + row[len(west) :] for west, row in zip(close, rows, strict=False)]
-    board = parse("\n".join(rows).replace("o", GROUND if entrances == "multiple" else WALL))
-    north, south = board.starts[:6], board.starts[6:]
-    starts = [start for n in range(3) for start in (north[n], north[-1 - n], south[-1 - n], south[n])]
+        close_rows = _CLOSE_ROOM.split()
+        rows[: len(close_rows)] = [
+            room_row + row[len(room_row) :] for room_row, row in zip(close_rows, rows, strict=False)
+        ]
+    opening = SIGN_OF["ground"] if entrances == "multiple" else SIGN_OF["wall"]
+    board = parse("\n".join(rows).replace("o", opening))
     walls = () if entrances == "none" else board.walls
-    return replace(board, starts=tuple(starts[:agents]), walls=walls)
+    starts = tuple(board.starts[number] for number in _ROOM_STARTS[:agents])
+    return replace(board, starts=starts, walls=walls)
 
 
 def room_cells() -> Bool:
     """Return the cells of each room of `rooms`, bool [4, 19, 53], in the order of `ROOM_NAMES`.
 
-    Those of the corridor are in no room. They are the same without walls. Agent i begins in room i % 4.
+    Cells of the corridor are in no room. The rooms have the same cells under all `entrances`, also without
+    walls. Agent i starts in room i % 4.
     """
     cells = np.zeros((len(_ROOM_SLICES), 19, 53), np.bool_)
     for room, (rows, columns) in enumerate(_ROOM_SLICES):
@@ -420,83 +464,89 @@ def room_cells() -> Bool:
 def random(
     height: int, width: int, *, agents: int, density: float, clustering: float = 0.0, seed: int = 0
 ) -> Map:
-    """Return a board with random sites and no walls; agents start on random cells without a site.
-
-    Sites are placed one by one: with probability `clustering` on a free cell next to an existing site,
-    otherwise on any free cell. At 0 they are independent; near 1 they form a single patch.
+    """Generate a board with random sites and without walls; agents start on random cells without a site.
 
     Args:
-        density: Sites per cell, above 0, at most 1. The number of sites is density x H x W, rounded, at
-            least 1.
+        height: the number of rows H.
+        width: the number of columns W.
+        agents: the number of agents N.
+        density: the share of cells that are sites, above 0, at most 1. The number of sites is
+            density x H x W, rounded, and at least 1.
+        clustering: the probability with which a site is placed on a free cell next to an earlier site, and
+            not on any free cell. At 0 sites are independent; near 1 they form a single patch.
+        seed: the seed of the random numbers; equal arguments give equal boards.
     """
     height = checked("height", height, Side)
     width = checked("width", width, Side)
-    check_cells("the board", height, width)
+    check_board_size("the board", height, width)
     agents = checked("agents", agents, Annotated[int, Range(1, LARGEST_BOARD_CELLS)])
     density = checked("density", density, PositiveShare)
     clustering = checked("clustering", clustering, Share)
     rng = np.random.default_rng(checked("seed", seed, Seed))
-    cells = height * width
-    count = max(1, round(density * cells))
-    if count + agents > cells:
+    cell_count = height * width
+    site_count = max(1, round(density * cell_count))
+    if site_count + agents > cell_count:
         raise ValueError(
-            f"{count} sites and {agents} agents do not fit on {cells} cells; allowed: a lower density, or "
-            "fewer agents"
+            f"{site_count} sites and {agents} agents do not fit on {cell_count} cells; allowed: a lower "
+            "density, or fewer agents"
         )
-    free, beside = _Cells(cells, full=True), _Cells(cells)  # beside: free cells next to a site
-    for _ in range(count):
-        near = beside.count and rng.random() < clustering
-        choices = beside if near else free
-        cell = choices.at(int(rng.integers(choices.count)))
-        free.discard(cell)
-        beside.discard(cell)
-        row, col = divmod(cell, width)
-        for inside, neighbour in (
-            (row > 0, cell - width),
-            (row < height - 1, cell + width),
-            (col > 0, cell - 1),
-            (col < width - 1, cell + 1),
-        ):
-            if inside and free.has[neighbour]:
-                beside.add(neighbour)
-    places = np.flatnonzero(np.frombuffer(free.has, np.bool_))
-    chosen = places[rng.choice(len(places), agents, replace=False)].tolist()
-    starts = tuple((*divmod(cell, width), int(rng.integers(4))) for cell in chosen)
-    sites = tuple(divmod(cell, width) for cell in range(cells) if not free.has[cell])
+    is_free = _free_of_random_sites(height, width, site_count, clustering, rng)
+    free_cells = np.argwhere(is_free)
+    start_cells = free_cells[rng.choice(len(free_cells), agents, replace=False)].tolist()
+    starts = tuple((row, col, int(rng.integers(4))) for row, col in start_cells)
+    sites = tuple((row, col) for row, col in np.argwhere(~is_free).tolist())
     return Map(height=height, width=width, sites=sites, starts=starts)
 
 
-class _Cells:
-    """A set of cells, 0 .. cells - 1, whose n-th smallest is quickly found on large boards too: ascending
-    cells in blocks of about the square root of their largest number."""
+def _free_of_random_sites(
+    height: int, width: int, site_count: int, clustering: float, rng: np.random.Generator
+) -> Bool:
+    """Place random sites one by one, and return the cells without a site, bool [H, W]."""
+    free = _CellSet(np.ones((height, width), np.bool_))
+    free_beside_sites = _CellSet(np.zeros((height, width), np.bool_))
+    for _ in range(site_count):
+        is_clustered = free_beside_sites.count and rng.random() < clustering
+        choices = free_beside_sites if is_clustered else free
+        row, col = choices.find(int(rng.integers(choices.count)))
+        free.remove(row, col)
+        free_beside_sites.remove(row, col)
+        for neighbour in ((row - 1, col), (row + 1, col), (row, col - 1), (row, col + 1)):
+            is_on_board = 0 <= neighbour[0] < height and 0 <= neighbour[1] < width
+            if is_on_board and free.contains[neighbour]:
+                free_beside_sites.add(*neighbour)
+    return free.contains
 
-    def __init__(self, cells: int, *, full: bool = False) -> None:
-        self.has = bytearray([full]) * cells
-        """By cell, whether it is in the set."""
-        self.count = cells * full
-        self._size = isqrt(cells) + 1
-        firsts = range(0, cells, self._size)
-        self._blocks = [list(range(cells)[first : first + self._size] if full else ()) for first in firsts]
-        self._lengths = np.array(list(map(len, self._blocks)))
 
-    def at(self, place: int) -> int:
-        """Return the cell at a place in ascending order."""
-        ends = self._lengths.cumsum()
-        block = int(ends.searchsorted(place, side="right"))
-        return self._blocks[block][place - int(ends[block])]
+class _CellSet:
+    """A set of cells that finds its n-th cell in reading order quickly, since it counts the cells of each
+    row."""
 
-    def add(self, cell: int) -> None:
-        if not self.has[cell]:
-            insort(self._blocks[cell // self._size], cell)
-            self._note(cell, 1)
+    def __init__(self, contains: Bool) -> None:
+        self.contains = contains
+        """bool [H, W], True for the cells in the set."""
+        self.count = int(contains.sum())
+        """The number of cells in the set."""
+        self._row_counts = contains.sum(1)
 
-    def discard(self, cell: int) -> None:
-        if self.has[cell]:
-            block = self._blocks[cell // self._size]
-            del block[bisect_left(block, cell)]
-            self._note(cell, -1)
+    def find(self, index: int) -> Cell:
+        """Return the cell with this index in reading order."""
+        ends = self._row_counts.cumsum()
+        row = int(ends.searchsorted(index, side="right"))
+        columns = np.flatnonzero(self.contains[row])
+        # `index - ends[row]` is negative: it counts back from the last cell of the row.
+        return row, int(columns[index - ends[row]])
 
-    def _note(self, cell: int, more: int) -> None:
-        self.has[cell] = more > 0
-        self._lengths[cell // self._size] += more
-        self.count += more
+    def add(self, row: int, col: int) -> None:
+        """Put a cell into the set, where it may be already."""
+        self._set(row, col, True)
+
+    def remove(self, row: int, col: int) -> None:
+        """Take a cell out of the set, where it may not be."""
+        self._set(row, col, False)
+
+    def _set(self, row: int, col: int, is_contained: bool) -> None:
+        """Set whether a cell is in the set, and update the counts."""
+        change = is_contained - int(self.contains[row, col])
+        self.contains[row, col] = is_contained
+        self._row_counts[row] += change
+        self.count += change

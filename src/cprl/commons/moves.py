@@ -1,4 +1,4 @@
-"""Walking, clashes between agents that want the same cell, and how agents return to play, on one world."""
+"""Walking, clashes between agents that want the same cell, and the return to play, on one world."""
 
 from __future__ import annotations
 
@@ -15,16 +15,18 @@ if TYPE_CHECKING:
     from cprl.commons.world import Scratch, Worlds
 
 ALL_BACK, ONE_MOVES, IN_TURN, PAIRWISE = range(4)
-"""`Rules.clashes`, in the order of its words."""
+"""The values of `Tables.clashes`, in the order of the words that `Rules.clashes` allows."""
 
 WALK_TURN = (0, 2, 3, 1)
-"""Right turns by 90 degrees from the heading to the direction of a walk: forward, backward, left, right."""
+"""For each walk (forward, backward, left, right) the right turns by 90 degrees from the heading to its
+direction."""
 
-TURN_LEFT, TURN_RIGHT, FIRE = 4, 5, 6
+TURN_LEFT, TURN_RIGHT, FIRE = range(4, 7)
+"""The actions after the four walks, by index."""
 
 
 def cell_of(row: int, col: int, tables: Tables) -> int:
-    """Return the index of a cell (row, col) in the tables and in the picture."""
+    """Return the index of a cell in tables and picture, which have a rim of wall around the board."""
     return (row + tables.rim) * tables.stride + col + tables.rim
 
 
@@ -34,14 +36,14 @@ def is_wall(row: int, col: int, tables: Tables) -> bool:
 
 
 def without_signal(tables: Tables, action: int) -> int:
-    """Return the action without the signal that is sent with it."""
+    """Return an action without the signal that the agent sends with it."""
     if tables.signals == 0:  # a division takes as long as the rest of an action
         return action
     return action % tables.silent_actions
 
 
 def draw_order(world: Worlds, scratch: Scratch) -> None:
-    """Draw a permutation of the agents, all equally likely, into `scratch.order`; see `shuffle_starts`."""
+    """Draw a permutation of the agents into `scratch.order`, all equally likely, as `shuffle_starts` does."""
     for i in range(world.row.shape[0]):
         scratch.order[i] = i
     for i in range(world.row.shape[0] - 1, 0, -1):
@@ -50,7 +52,7 @@ def draw_order(world: Worlds, scratch: Scratch) -> None:
 
 
 def walk(world: Worlds, tables: Tables, i: int, direction: int) -> None:
-    """Move agent i by one cell in a direction (a heading), unless a wall is there."""
+    """Move agent i by one cell in a direction, given as a heading, unless a wall is there."""
     row = world.row[i] + ROW_STEP[direction]
     col = world.col[i] + COL_STEP[direction]
     if not is_wall(row, col, tables):
@@ -65,7 +67,7 @@ def go_back(world: Worlds, scratch: Scratch, i: int) -> None:
 
 
 def has_moved(world: Worlds, scratch: Scratch, i: int) -> bool:
-    """Return whether agent i is on another cell than at the start of the turn."""
+    """Return whether agent i has left the cell where it began the turn."""
     return world.row[i] != scratch.start_row[i] or world.col[i] != scratch.start_col[i]
 
 
@@ -89,8 +91,8 @@ def clash(world: Worlds, scratch: Scratch, i: int, j: int) -> bool:
     return share_a_cell(world, i, j) or have_swapped(world, scratch, i, j)
 
 
-def shares_a_cell(world: Worlds, i: int) -> bool:
-    """Return whether agent i is on one cell with another agent in play."""
+def has_company(world: Worlds, i: int) -> bool:
+    """Return whether agent i shares its cell with another agent in play."""
     for j in range(world.row.shape[0]):
         if j != i and world.in_play[j] and share_a_cell(world, i, j):
             return True
@@ -98,7 +100,7 @@ def shares_a_cell(world: Worlds, i: int) -> bool:
 
 
 def settle_clashes(world: Worlds, tables: Tables, scratch: Scratch) -> None:
-    """Take back moves that clash, by `Rules.clashes`; those of "in_turn" are settled as agents move."""
+    """Undo moves that clash, as `Rules.clashes` says; under "in_turn" `act` has undone them already."""
     if tables.clashes == PAIRWISE:
         settle_pairwise(world, scratch)
     elif tables.clashes != IN_TURN:
@@ -106,11 +108,11 @@ def settle_clashes(world: Worlds, tables: Tables, scratch: Scratch) -> None:
 
 
 def settle_at_once(world: Worlds, tables: Tables, scratch: Scratch) -> None:
-    """Move all agents back, at once, that moved into a clash, or under "one_moves" those of them that lose
-    their cell, and repeat this until no agents clash.
+    """Move all agents that moved into a clash back at once, and repeat this until no agents clash.
 
-    An agent that went back keeps its cell, which may cancel another move. The result does not depend on the
-    order of the agents, but for the order that "one_moves" draws by chance.
+    Under "one_moves" one agent gets the cell and only the others go back. An agent that went back keeps its
+    cell, which may cancel another move. So the result does not depend on the order of the agents, except for
+    the order that "one_moves" draws by chance.
     """
     one_moves = tables.clashes == ONE_MOVES
     if one_moves:
@@ -131,8 +133,11 @@ def settle_at_once(world: Worlds, tables: Tables, scratch: Scratch) -> None:
 
 
 def loses_its_cell(world: Worlds, scratch: Scratch, i: int) -> bool:
-    """Return whether agent i, which has moved, swaps cells with another agent in play, or loses its cell to
-    one that stays there, or comes first in `scratch.order`."""
+    """Return whether agent i, which has moved, has to go back.
+
+    It has to if it swaps cells with another agent in play, if another agent stayed on its new cell, or if
+    another one moved there and comes first in `scratch.order`.
+    """
     for j in range(world.row.shape[0]):
         if j != i and world.in_play[j]:
             is_first = not has_moved(world, scratch, j) or scratch.order[j] < scratch.order[i]
@@ -150,7 +155,7 @@ def is_in_a_clash(world: Worlds, scratch: Scratch, i: int) -> bool:
 
 
 def settle_pairwise(world: Worlds, scratch: Scratch) -> None:
-    """[run] Move both agents of a clash back, pair by pair in the order of indices, even onto a third one."""
+    """[run] Move both agents of a clash back, pair by pair by index, even onto a third agent."""
     for i in range(world.row.shape[0]):
         for j in range(i + 1, world.row.shape[0]):
             if world.in_play[i] and world.in_play[j] and clash(world, scratch, i, j):
@@ -166,11 +171,11 @@ def count_down(world: Worlds) -> None:
 
 
 def return_to_play(world: Worlds, tables: Tables, scratch: Scratch) -> None:
-    """Bring agents back into play that have no more turns to miss, if their cell is free; under
-    `respawn_at_spawns` at a free spawn place.
+    """Bring the agents back into play that have missed all their turns.
 
-    Agents that wait for the same cell return in the order in which they were tagged. Where clashes are
-    settled "pairwise", no agent waits.
+    Each returns to its cell once that is free, or under `respawn_at_spawns` to a free spawn place. Agents
+    that wait for the same cell return in the order in which they were tagged. Where clashes are settled
+    "pairwise", no agent waits.
     """
     if tables.respawn_at_spawns:
         respawn(world, tables)
@@ -184,16 +189,14 @@ def return_to_play(world: Worlds, tables: Tables, scratch: Scratch) -> None:
 
 
 def respawn(world: Worlds, tables: Tables) -> None:
-    """Bring agents back into play that have no more turns to miss, at free spawn places, as far as there
-    are."""
+    """Bring the agents that have missed all their turns back at spawn places, as long as places are free."""
     for i in range(world.row.shape[0]):
         if not world.in_play[i] and world.out_steps[i] == 0:
             world.in_play[i] = draw_place(world, tables, i)
 
 
 def has_to_wait(world: Worlds, i: int) -> bool:
-    """Return whether agent i, out of play, has to wait: its cell is occupied, or another agent is first in
-    line."""
+    """Return whether agent i, out of play, has to wait: its cell is taken, or another returns first."""
     for j in range(world.row.shape[0]):
         if j != i and share_a_cell(world, i, j):
             first_in_line = world.out_steps[j] == 0 and world.tagged_step[j] < world.tagged_step[i]
@@ -203,7 +206,7 @@ def has_to_wait(world: Worlds, i: int) -> bool:
 
 
 def place_at_starts(world: Worlds, tables: Tables) -> None:
-    """Put every agent in play at its start, with the heading given by the map."""
+    """Put every agent in play at its start, with the heading of the map, and clear what it did before."""
     for i in range(world.row.shape[0]):
         world.row[i] = tables.start[i, 0]
         world.col[i] = tables.start[i, 1]
@@ -235,10 +238,13 @@ def shuffle_starts(world: Worlds) -> None:
 
 
 def draw_starts(world: Worlds, tables: Tables) -> None:
-    """Draw a spawn place for each agent whose start is one, no two the same, and under `random_headings` all
-    headings."""
+    """Move each agent that starts at a spawn place to a spawn place drawn by chance, no two to the same.
+
+    Under `random_headings` also draw the heading of every agent.
+    """
     if tables.spawns.shape[0] == 0 and not tables.random_headings:
         return
+    # Agents that still need a place are out of play, so that they block none.
     for i in range(world.row.shape[0]):
         world.in_play[i] = True
         for s in range(tables.spawns.shape[0]):
@@ -252,21 +258,20 @@ def draw_starts(world: Worlds, tables: Tables) -> None:
 
 
 def draw_place(world: Worlds, tables: Tables, i: int) -> bool:
-    """Put agent i, out of play, at a spawn place where no agent in play is, all equally likely; return
-    whether there is one."""
-    free = 0
+    """Put agent i, out of play, at a free spawn place, all equally likely; return whether one is free."""
+    free_places = 0
     for s in range(tables.spawns.shape[0]):
-        free += is_free(world, tables, s)
-    if free == 0:
+        free_places += is_free(world, tables, s)
+    if free_places == 0:
         return False
     words = draw(world, SPAWNS | i)
-    place = np.int64(words[0] % np.uint64(free))
+    places_to_skip = np.int64(words[0] % np.uint64(free_places))
     for s in range(tables.spawns.shape[0]):
         if is_free(world, tables, s):
-            if place == 0:
+            if places_to_skip == 0:
                 world.row[i] = tables.spawns[s, 0]
                 world.col[i] = tables.spawns[s, 1]
-            place -= 1
+            places_to_skip -= 1
     if tables.random_headings:
         world.heading[i] = words[1] % np.uint64(4)
     return True

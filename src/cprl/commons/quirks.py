@@ -1,17 +1,17 @@
-"""What only the program of 2019 does: the group of rules `Quirks2019`, on one world.
+"""Quirks2019: a group of rules with the quirks of the program of 2019. The rules work on one world.
 
-Each is a behaviour of the program that produced the results of [W] M. Wiatrak, "Governing the Commons with
-Multi-Agent Reinforcement Learning" (2019), where it differs from the text. A game without the group is
-compiled without it.
+A quirk is a behaviour in which the program that produced the results of [W] M. Wiatrak, "Governing the
+Commons with Multi-Agent Reinforcement Learning" (2019), differs from the text. A game without this group is
+compiled without its code.
 """
 
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from cprl.commons.headings import DOWN, UP
-from cprl.institutions.arrays import Kept
+from cprl.institutions.arrays import InState
 from cprl.values import Value
-from cprl.values.arrays import UInt8
+from cprl.values.array_types import UInt8
 
 if TYPE_CHECKING:
     from cprl.commons.world import Worlds
@@ -19,17 +19,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Quirks2019(Value):
-    """What the program of 2019 does otherwise than the text of the study: all of it, but for what is
-    False."""
+    """The quirks of the program of 2019, which differs from the text of the study; False leaves one out."""
 
     freeze_counts_tag_turn: bool = True
-    """The turn of the tag counts as the first of `Rules.freeze_steps`, so the agent misses one turn less."""
+    """The turn of a tag counts as the first of `Rules.freeze_steps`, so an agent misses one turn less."""
 
     ends_one_turn_late: bool = True
-    """The episode terminates in the turn that begins with an empty stock, one turn later."""
+    """The episode terminates one turn late, in the turn that begins without any apple."""
 
     picture_shows_old_stock: bool = True
-    """The picture shows the apples of the start of the turn."""
+    """The picture shows the apples as they were at the start of the turn."""
 
     paint_over: bool = True
     """Heading marks cover apples and agents of lower indices; beams cover everything."""
@@ -38,12 +37,12 @@ class Quirks2019(Value):
     """The heading mark of an agent that faces up or down is painted behind the agent."""
 
     self_paint_stays: bool = True
-    """Windows are drawn in the order of agent indices; each agent's cell is painted as "self" and stays so in
-    the windows of later agents, whether the agent is in play or not."""
+    """The windows are drawn in the order of agent indices. Each agent's cell is painted as "self" for its own
+    window and stays so in the windows of later agents, whether the agent is in play or not."""
 
 
 class Arrays(NamedTuple):
-    """The quirks of a game, and what they remember of its worlds."""
+    """The quirks of a game, and the memory that they need in each world."""
 
     freeze_counts_tag_turn: bool
     ends_one_turn_late: bool
@@ -51,17 +50,17 @@ class Arrays(NamedTuple):
     paint_over: bool
     mark_behind_if_vertical: bool
     self_paint_stays: bool
-    stock_before: Annotated[UInt8, "B K", Kept(high=1, cleared=False)]
+    stock_before: Annotated[UInt8, "B K", InState(high=1, cleared=False)]
     """The stock at the start of the turn."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters among `Arrays`."""
+    """Return the parameters in `Arrays` by name."""
     return {name: getattr(game.rules.quirks, name) for name in Arrays._fields if name != "stock_before"}
 
 
 def keep_old_stock(world: "Worlds", quirks: Arrays | None) -> None:
-    """Copy the stock, which the picture of this turn shows."""
+    """Copy the stock at the start of a turn, since the picture of this turn may show it."""
     if quirks is not None:
         for k in range(world.stock.shape[0]):
             quirks.stock_before[k] = world.stock[k]
@@ -75,19 +74,19 @@ def shows_apple(world: "Worlds", quirks: Arrays | None, k: int) -> bool:
 
 
 def turns_missed(freeze_steps: int, quirks: Arrays | None) -> int:
-    """Return the turns after that of a tag that an agent misses."""
+    """Return the number of turns that an agent misses after the turn in which it is tagged."""
     if quirks is not None and quirks.freeze_counts_tag_turn:
         return max(0, freeze_steps - 1)
     return freeze_steps
 
 
 def ends_late(quirks: Arrays | None) -> bool:
-    """Return whether an empty board ends an episode a turn later."""
+    """Return whether an empty board ends an episode only one turn later."""
     return quirks is not None and quirks.ends_one_turn_late
 
 
 def paints_over(quirks: Quirks2019 | Arrays | None) -> bool:
-    """Return whether marks and beams cover what they are painted on."""
+    """Return whether heading marks and beams cover what is on their cells."""
     return quirks is not None and quirks.paint_over
 
 

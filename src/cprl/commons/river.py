@@ -1,8 +1,7 @@
-"""The river: the group of rules `River`, waste that keeps apples from growing and beams that clean it, on one
-world.
+"""River: a group of rules about waste in a river, which keeps apples from growing until agents clean it.
 
-[C] is cleanup of the program sequential_social_dilemma_games; see `docs/games.md`. A game without a river is
-compiled without it.
+The rules work on one world. [C] is the game cleanup of the program sequential_social_dilemma_games, see
+`docs/games.md`. A game without a river is compiled without the code of this group.
 """
 
 from dataclasses import dataclass
@@ -14,40 +13,42 @@ from cprl.commons.beam import beam_begin, beam_cell, beam_end
 from cprl.commons.cells import WALL
 from cprl.commons.chance import POLLUTION, Probability, draw
 from cprl.commons.moves import cell_of, draw_order
-from cprl.institutions.arrays import DERIVED, STATE, Kept
-from cprl.institutions.base import threshold
+from cprl.institutions.arrays import DERIVED, IN_STATE, InState
+from cprl.institutions.institution import threshold
 from cprl.values import Range, Value
-from cprl.values.arrays import Bool, Float32, Int32, Int64, UInt8, UInt32
+from cprl.values.array_types import Bool, Float32, Int32, Int64, UInt8, UInt32
 
 if TYPE_CHECKING:
     from cprl.commons.tables import Tables
     from cprl.commons.world import Scratch, Worlds
 
 CLEAN: Final = "clean"
-"""A further action, the last one, of agents that may clean."""
+"""The name of a further action, the last one, in games whose agents may clean."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class River(Value):
-    """The rules of a board with a river, `Map.river`: waste comes, keeps apples from growing, and is
+    """The rules of a board with a river (`Map.river`): how waste appears, slows the growth of apples, and is
     cleaned."""
 
     may_clean: bool = False
-    """[C] Whether agents may clean the river: a further action "clean", a beam of the size of the other one
-    that removes the waste of the first cell of each column that has some, and ends there, at a wall or at an
-    agent. The picture shows it up to walls, as the other one: also beyond waste, and beyond agents without
+    """Whether agents may clean the river [C], by a further action "clean".
+
+    This fires a cleaning beam of the same size as the beam that tags. Each of its columns removes the waste
+    of the first cell with waste, and ends there, at a wall or at an agent. The picture shows the whole beam
+    up to walls, like the other beam: also beyond waste, and beyond agents unless
     `Rules.beam_stops_at_agents`."""
 
     pollution_prob: Probability = 0.0
-    """[C] The probability per turn with which a clean cell of the river gets waste, tried cell by cell in an
-    order drawn by chance until one gets some; so it is one cell a turn at most."""
+    """The probability per turn with which a clean cell of the river gets waste [C]. The cells are tried one
+    by one, in an order drawn by chance, until one gets waste; so at most one cell per turn does."""
 
     pollution_limit: Annotated[float, Range(0, 1)] = 0.4
-    """[C] The share of the river's cells with waste from which on no apple grows, and no waste comes."""
+    """The share of river cells with waste at and above which no apple grows and no more waste appears [C]."""
 
     pollution_free: Annotated[float, Range(0, 1)] = 0.0
-    """[C] The share up to which apples grow with `Rules.regrow_prob`; between the two it falls linearly to
-    0."""
+    """The share of river cells with waste up to which apples grow with `Rules.regrow_prob` [C]. From there
+    the probability of growth falls linearly, to 0 at `pollution_limit`."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -59,49 +60,49 @@ class River(Value):
 
 
 class Arrays(NamedTuple):
-    """The river of a game, of R cells, and what is remembered of it in its worlds."""
+    """The river of a game, which has R cells, and its state in each world."""
 
     cell: Annotated[UInt32, "R"]
-    """The cell of each cell of the river; cells as in `cprl.commons.tables.Tables`."""
+    """The index on the board of each cell of the river; cells as in `cprl.commons.tables.Tables`."""
     at: Annotated[Int32, "cells"]
-    """The index of each cell in the river, or -1."""
+    """The index in the river of each cell of the board, or -1."""
     first_waste: Annotated[UInt8, "R"]
     """1 where a cell of the river has waste when an episode begins."""
     pollute_below: Annotated[Int64, "counts"]
-    """[R + 1], by the number of clean cells: one of them gets waste if a uniform 32-bit word is below this
-    threshold."""
+    """Thresholds [R + 1], by the number of clean cells: one of them gets waste if a uniform 32-bit word is
+    below the threshold."""
     limit: float
     free: float
     clean_number: int
-    """The action that cleans; -1 where there is none."""
-    waste: Annotated[UInt8, "B R", Kept(high=1, cleared=False)]
-    """1 where a cell has waste."""
+    """The index of the action "clean"; -1 if agents may not clean."""
+    waste: Annotated[UInt8, "B R", InState(high=1, cleared=False)]
+    """1 where a cell of the river has waste."""
     waste_left: Annotated[Int32, "B 1", DERIVED]
     """The sum of `waste`."""
-    cleans: Annotated[Bool, "B N", STATE]
-    """Whether the agent cleaned in the last turn."""
+    cleans: Annotated[Bool, "B N", IN_STATE]
+    """True for agents that cleaned in the last turn."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters among `Arrays`."""
-    board, rules, tables = game.map, game.rules, game.tables
-    cells = [cell_of(row, col, tables) for row, col in board.river]
-    at = np.full(tables.background.size, -1)
-    at[cells] = range(len(cells))
-    prob = rules.river.pollution_prob
+    """Return the parameters in `Arrays` by name."""
+    river = game.rules.river
+    cells = [cell_of(row, col, game.tables) for row, col in game.map.river]
+    river_index = np.full(game.tables.background.size, -1)
+    river_index[cells] = range(len(cells))
+    stays_clean_prob = 1 - river.pollution_prob
     return {
         "cell": cells,
-        "at": at,
-        "first_waste": np.isin(np.arange(len(cells)), board.waste),
-        "pollute_below": [threshold(1 - (1 - prob) ** clean) for clean in range(len(cells) + 1)],
-        "limit": rules.river.pollution_limit,
-        "free": rules.river.pollution_free,
-        "clean_number": rules.actions.index(CLEAN) if rules.river.may_clean else -1,
+        "at": river_index,
+        "first_waste": np.isin(np.arange(len(cells)), game.map.waste),
+        "pollute_below": [threshold(1 - stays_clean_prob**count) for count in range(len(cells) + 1)],
+        "limit": river.pollution_limit,
+        "free": river.pollution_free,
+        "clean_number": game.rules.actions.index(CLEAN) if river.may_clean else -1,
     }
 
 
 def begin_river(river: Arrays | None) -> None:
-    """Put waste on the cells that have some when an episode begins."""
+    """Begin an episode: put waste on the cells that the map gives waste, and clear what agents cleaned."""
     if river is not None:
         for r in range(river.waste.shape[0]):
             river.waste[r] = river.first_waste[r]
@@ -111,7 +112,7 @@ def begin_river(river: Arrays | None) -> None:
 
 
 def count_waste(river: Arrays | None) -> None:
-    """Recompute the number of cells with waste."""
+    """Count the cells with waste."""
     if river is not None:
         river.waste_left[0] = 0
         for r in range(river.waste.shape[0]):
@@ -119,21 +120,23 @@ def count_waste(river: Arrays | None) -> None:
 
 
 def aim_to_clean(river: Arrays | None, i: int, is_in_play: bool, action: int) -> None:
-    """Note whether agent i cleans in this turn."""
+    """Note whether agent i cleans in this turn by its action."""
     if river is not None:
         river.cleans[i] = is_in_play and action == river.clean_number
 
 
 def is_cleaning(river: Arrays | None, i: int) -> bool:
-    """Return whether agent i cleaned in the last turn."""
+    """Return whether agent i cleaned by its latest action."""
     return river is not None and river.cleans[i]
 
 
 def clean(
     world: "Worlds", tables: "Tables", river: Arrays | None, scratch: "Scratch", cleaned: Float32
 ) -> None:
-    """Let the agents that clean do so one after another, in an order drawn by chance; `cleaned`: float32 [N],
-    cells cleaned."""
+    """Let the agents that clean fire their beams one after another, in an order drawn by chance.
+
+    Write the number of cells that each agent cleaned to `cleaned`, float32 [N].
+    """
     if river is not None:
         draw_order(world, scratch)
         for n in range(world.row.shape[0]):
@@ -145,8 +148,10 @@ def clean(
 
 
 def clean_column(world: "Worlds", tables: "Tables", river: Arrays, i: int, side: int) -> int:
-    """Clean the first cell with waste in a column of agent i's beam, which ends there, at a wall or at an
-    agent; return the cells cleaned."""
+    """Clean the first cell with waste in a column of agent i's beam; return the number of cells cleaned.
+
+    The column ends at this cell, at a wall or at an agent, so the number is 0 or 1.
+    """
     for ahead in range(beam_begin(tables, side), beam_end(world, tables, i, side) + 1):
         cell = beam_cell(world, tables, i, ahead, side)
         if tables.background[cell] == tables.paints[WALL]:
@@ -169,7 +174,7 @@ def write_waste(river: Arrays | None, waste: Int64) -> None:
 
 
 def growth_share(river: Arrays | None) -> float:
-    """Return what is left of the growth of apples at this share of waste, 0..1."""
+    """Return the factor, 0..1, by which the waste in the river reduces the growth of apples."""
     if river is None:
         return 1.0
     share = river.waste_left[0] / max(1, river.waste.shape[0])
@@ -179,25 +184,25 @@ def growth_share(river: Arrays | None) -> float:
 
 
 def slowed(below: int, river: Arrays | None) -> int:
-    """Return the threshold of a site's growth where waste slows it."""
+    """Return the threshold `below` of a site's growth, reduced by the waste in the river."""
     if river is None:
         return below
     return int(below * growth_share(river))
 
 
 def pollute(world: "Worlds", river: Arrays | None) -> None:
-    """Put waste on a clean cell of the river, or on none; all clean cells are equally likely."""
+    """Put waste on one clean cell of the river or on none, by chance; all clean cells are equally likely."""
     if river is None:
         return
     cells = river.waste.shape[0]
-    left = cells - river.waste_left[0]
+    clean_cells = cells - river.waste_left[0]
     words = draw(world, POLLUTION)
-    if growth_share(river) == 0.0 or np.int64(words[0]) >= river.pollute_below[left]:
+    if growth_share(river) == 0.0 or np.int64(words[0]) >= river.pollute_below[clean_cells]:
         return
-    place = np.int64(words[1] % np.uint64(left))
+    cells_to_skip = np.int64(words[1] % np.uint64(clean_cells))
     for r in range(cells):
         if river.waste[r] == 0:
-            if place == 0:
+            if cells_to_skip == 0:
                 river.waste[r] = 1
                 river.waste_left[0] += 1
-            place -= 1
+            cells_to_skip -= 1

@@ -1,4 +1,4 @@
-"""Spaces: what every agent of an environment observes and may do; learners and networks are made from it."""
+"""Spaces: the shapes of observations and actions, from which learners and networks are made."""
 
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -10,24 +10,25 @@ DTYPES: Final = (
     *("float16", "float32", "float64"),  # numpy has no bfloat16
 )
 Dtype = Annotated[str, Where(lambda name: name in DTYPES, ", ".join(map(repr, DTYPES)))]
-"""By the name that numpy and torch share."""
+"""The name of a dtype, as numpy and torch share it."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Spaces(Value, stored=False):
-    """The observation and action spaces of N agents, the same for each.
+    """The observation and action space of N agents, which is the same for each of them.
 
-    `Game.spaces` gives those of a game, `cprl.envs.spaces_of(env)` those of an environment with its
-    transforms.
+    `Game.spaces` returns the spaces of a game, and `cprl.envs.spaces_of(env)` those of an environment with
+    its transforms.
     """
 
     agents: Positive
     """The number of agents N."""
     observation_shape: tuple[Positive, ...]
-    """Of ("agents", "observation") of one agent; (C, X, Y) for windows."""
+    """The shape of ("agents", "observation") for one agent; (C, X, Y) for windows."""
     observation_dtype: Dtype = "uint8"
-    """Its dtype, by numpy's and torch's common name."""
+    """The dtype of observations."""
     observation_scale: Annotated[float, Range(1e-30, 2.0**64)] = 255.0
-    """By which networks divide observations: the largest value of integers, 1 for floating-point numbers."""
+    """The number by which networks divide observations: the largest value of integer observations, 1 for
+    floating-point ones."""
     actions: Positive
-    """How many actions A an agent chooses from."""
+    """The number of actions A from which an agent chooses."""

@@ -1,4 +1,4 @@
-"""The state of B worlds as plain arrays, and the check that it has the form of a game's."""
+"""The state of B worlds as plain arrays by name, and the check that a state fits a game."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,22 +6,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cprl.commons import world
 from cprl.commons.game import Game
-from cprl.commons.rules import GROUPS
 from cprl.commons.world import empty_worlds
-from cprl.institutions import ledger
-from cprl.institutions.arrays import lasting
-from cprl.institutions.law import MODULES, check_names, new_law
-from cprl.values import shown
+from cprl.institutions.arrays import state_arrays
+from cprl.institutions.law import new_law
+from cprl.values import short_repr
 
 State = dict[str, NDArray[Any]]
+"""The arrays of a state, [B, ...], by their names in `Worlds` and `Law`."""
 
-check_names((world, *GROUPS.values(), ledger, *MODULES.values()))
 
-
-def numbers(game: Game) -> dict[str, int]:
-    """Return the numbers of a game that `Kept.high` names."""
+def largest_entries(game: Game) -> dict[str, int]:
+    """Return the largest entries of arrays that depend on the game, by the names that `InState.high` uses."""
     rules = game.rules
     return {
         "last_row": game.map.height - 1,
@@ -33,51 +29,56 @@ def numbers(game: Game) -> dict[str, int]:
     }
 
 
-def checked(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
-    """Return a state as arrays, after checking names, shapes, dtypes and ranges of its entries.
+def check_state(state: Mapping[str, Any], *, worlds: int, game: Game) -> State:
+    """Return a state as arrays, after checking the names, shapes, dtypes and ranges of its entries.
 
-    Whether a game comes into it is not checked, e.g. that no agent is in a wall.
+    It is not checked whether a game can reach the state: an agent may be inside a wall.
+
+    Raises:
+        ValueError: for a state that does not fit this number of worlds of the game.
     """
-    expected = {name: (array, how) for name, array, how in lasting(empty_worlds(game, worlds))}
+    expected = {name: entry for name, *entry in state_arrays(empty_worlds(game, worlds))}
     if game.institutions:
-        expected |= {name: (array, how) for name, array, how in lasting(new_law(game, worlds))}
+        expected |= {name: entry for name, *entry in state_arrays(new_law(game, worlds))}
     if set(state) != set(expected):
         missing = sorted(set(expected) - set(state))
         unknown = sorted(map(str, set(state) - set(expected)))
         raise ValueError(
-            f"the state lacks {missing} and has the unknown entries {shown(unknown)}; allowed: exactly "
+            f"the state lacks {missing} and has the unknown entries {short_repr(unknown)}; allowed: exactly "
             f"{sorted(expected)}"
         )
     arrays = {name: _as_array(name, state[name]) for name in expected}
-    highest = numbers(game)
-    for name, (form, how) in expected.items():
+    largest = largest_entries(game)
+    for name, (example, entry_range) in expected.items():
         array = arrays[name]
-        if array.shape != form.shape or array.dtype != form.dtype:
+        if array.shape != example.shape or array.dtype != example.dtype:
             raise ValueError(
-                f"state[{name!r}] is {array.dtype} {list(array.shape)}; allowed: {form.dtype} "
-                f"{list(form.shape)}"
+                f"state[{name!r}] is {array.dtype} {list(array.shape)}; allowed: {example.dtype} "
+                f"{list(example.shape)}"
             )
-        high = highest[how.high] if isinstance(how.high, str) else how.high
-        _check_range(name, array, how.low, high)
+        high = largest[entry_range.high] if isinstance(entry_range.high, str) else entry_range.high
+        _check_range(name, array, entry_range.low, high)
     return arrays
 
 
 def _as_array(name: str, values: Any) -> NDArray[Any]:
-    """Return an entry as an array, e.g. of a list or a torch tensor."""
+    """Return an entry of a state, e.g. a list or a torch tensor, as a numpy array."""
     try:
         return np.asarray(values)
     except (ValueError, TypeError) as error:  # nested lists of unequal lengths, or memory of a GPU
-        raise ValueError(f"state[{name!r}] is {shown(values)}; allowed: an array on the CPU") from error
+        raise ValueError(f"state[{name!r}] is {short_repr(values)}; allowed: an array on the CPU") from error
 
 
 def _check_range(name: str, array: NDArray[Any], low: int, high: int) -> None:
-    """Refuse an entry out of range; numbers with a fraction have no upper bound."""
+    """Raise a ValueError for an array with an entry out of range; float64 entries have no upper bound."""
     if array.dtype == np.bool_:
         return
     if array.dtype == np.float64:
-        wrong, allowed = ~(np.isfinite(array) & (array >= 0)), "a number of at least 0"
+        wrong = ~(np.isfinite(array) & (array >= 0))
+        allowed = "a number of at least 0"
     else:
-        wrong, allowed = (array < low) | (array > high), f"{low} to {high}"
+        wrong = (array < low) | (array > high)
+        allowed = f"{low} to {high}"
     if wrong.any():
         index = tuple(int(entry) for entry in np.argwhere(wrong)[0])
         raise ValueError(f"state[{name!r}]{list(index)} is {array[index]}; allowed: {allowed}")

@@ -1,4 +1,4 @@
-"""The order of a turn and of an episode, and what institutions do in them, on one world."""
+"""The order of events in a turn and an episode, with those of institutions, on one world."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from cprl.commons.actions import act
-from cprl.commons.apples import bite_and_grow, fill, recount
+from cprl.commons.apples import fill, harvest_and_grow, recount
 from cprl.commons.beam import find_hits, tag, take_out
 from cprl.commons.chance import BALLOT, DETECTION, END, draw
 from cprl.commons.moves import (
@@ -27,7 +27,7 @@ from cprl.institutions.ledger import charge, count_violation, forget_episode, fo
 from cprl.institutions.sanctioner import appoint
 from cprl.institutions.sanctions import sanction_violation
 from cprl.institutions.votes import hold_ballot, is_due
-from cprl.values.arrays import Int64
+from cprl.values.array_types import Int64
 
 if TYPE_CHECKING:
     from cprl.commons.tables import Tables
@@ -47,13 +47,16 @@ def run_world(
 ) -> None:
     """Do a task with a world, and write its output.
 
-    `law` is what institutions need; without any it is None, and Numba compiles nothing of what asks for it.
-
     Args:
-        task: PLAY a turn, which a world that has ended sits out; BEGIN the next episode; or REFRESH the
-            output of a state that was set from outside.
-        actions: int64 [N].
-        decisions: int64 [N].
+        world: the state of the world, which is changed.
+        tables: the game.
+        task: PLAY a turn (a world whose episode has ended stays as it is), BEGIN the next episode, or
+            REFRESH: write the output that belongs to a state that was set from outside.
+        actions: int64 [N], read for PLAY.
+        decisions: int64 [N], read for PLAY in the first turn of an episode.
+        output: the output of the world, which is written.
+        law: the arrays of institutions; None without any, and then Numba compiles no code that needs them.
+        scratch: working memory.
     """
     if task == PLAY and world.ended[0] == PLAYING:
         play_turn(world, tables, actions, decisions, output, law, scratch)
@@ -87,7 +90,7 @@ def play_turn(
     act(world, tables, law, actions, scratch)
     settle_clashes(world, tables, scratch)
     clean(world, tables, world.groups.river, scratch, output.cleaned)
-    output.regrown[0] = bite_and_grow(world, tables, law, actions, scratch, output.harvest)
+    output.regrown[0] = harvest_and_grow(world, tables, law, actions, scratch, output.harvest)
     find_hits(world, tables, output.hit_by)
     tag(world, tables, law, output.hit_by, output.tagged_by)
     pursue_violations(world, law)
@@ -100,8 +103,10 @@ def play_turn(
 
 
 def begin_episode(world: Worlds, tables: Tables, law: Law | None) -> None:
-    """Start the next episode: all sites hold an apple, all agents are at their starts, if the rules say
-    nothing else; institutions forget the last one, but for what votes put in force."""
+    """Begin the next episode: put apples on sites and agents at their starts, as the rules say.
+
+    Institutions forget the last episode, except for the results of votes.
+    """
     world.episode[0] += 1
     world.step[0] = 0
     world.ended[0] = PLAYING
@@ -115,7 +120,11 @@ def begin_episode(world: Worlds, tables: Tables, law: Law | None) -> None:
 
 
 def check_end(world: Worlds, tables: Tables, began_empty: bool) -> None:
-    """End the episode: TERMINATED if no apple is left and none can grow, else TRUNCATED if out of time."""
+    """End the episode if it is over: TERMINATED if no apple is left and none can grow, TRUNCATED by time or
+    chance.
+
+    `began_empty`: whether the turn began without any apple.
+    """
     is_empty = began_empty if ends_late(world.groups.quirks) else world.stock_left[0] == 0
     if is_empty and tables.never_from_nothing:
         world.ended[0] = TERMINATED
@@ -124,15 +133,15 @@ def check_end(world: Worlds, tables: Tables, began_empty: bool) -> None:
 
 
 def ends_by_chance(world: Worlds, tables: Tables) -> bool:
-    """Return whether this turn is one after which an episode may end by chance, and it does."""
-    later = world.step[0] - tables.end_from_step
-    if tables.end_below == 0 or later < 0 or later % tables.end_every_steps > 0:
+    """Return whether the episode ends by chance after this turn, see `RandomEnd`."""
+    turns_since_first = world.step[0] - tables.end_from_step
+    if tables.end_below == 0 or turns_since_first < 0 or turns_since_first % tables.end_every_steps > 0:
         return False
     return int(draw(world, END)[0]) < tables.end_below
 
 
 def note_events(world: Worlds, output: StepOutput) -> None:
-    """Note who fired and who is on the board as the turn ends, and the reward without institutions."""
+    """Write which agents fired, and their rewards before institutions; note which are on the board."""
     for i in range(world.row.shape[0]):
         output.fired[i] = world.fired[i]
         output.reward[i] = output.harvest[i]
@@ -140,14 +149,15 @@ def note_events(world: Worlds, output: StepOutput) -> None:
 
 
 def keep_on_board(world: Worlds) -> None:
-    """Keep on the board who was tagged in this turn and is back in play already, as it misses no turn."""
+    """Keep agents on the board that were tagged in this turn but miss no turn, so that they are back in
+    play."""
     for i in range(world.row.shape[0]):
         if world.in_play[i] and world.tagged_step[i] == world.step[0]:
             world.on_board[i] = True
 
 
 def clear_events(world: Worlds, law: Law | None, output: StepOutput) -> None:
-    """Write that there was no harvest, shot, hit, growth, fine or transfer."""
+    """Write an output without events: no harvest, shot, hit, growth, fine or transfer."""
     agents = world.row.shape[0]
     for i in range(agents):
         output.harvest[i] = 0.0
@@ -182,7 +192,10 @@ def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scra
 
 
 def begin_turn(world: Worlds, law: Law | None, decisions: Int64) -> None:
-    """Clear the notes of the last turn; in the first one of an episode agents decide, and windows open."""
+    """Clear what institutions noted in the last turn; in the first turn of an episode also hold the ballots.
+
+    `decisions`: int64 [N].
+    """
     if law is None:
         return
     forget_turn(law.ledger)
@@ -196,20 +209,22 @@ def begin_turn(world: Worlds, law: Law | None, decisions: Int64) -> None:
 
 
 def end_turn(world: Worlds, law: Law | None) -> None:
-    """Collect, pay and forgive what is due at the end of a turn."""
+    """Let institutions collect, pay and forgive at the end of a turn."""
     if law is not None:
         settle(law, world.step[0], world.ended[0] != PLAYING)
 
 
 def open_next_turn(world: Worlds, law: Law | None) -> None:
-    """Begin what begins with the coming turn."""
+    """Let institutions prepare the coming turn, e.g. open the windows of quotas."""
     if law is not None:
         open_turn(law, world.step[0] + 1, stock_share(world))
 
 
 def begin_institutions(world: Worlds, law: Law | None) -> None:
-    """Begin an episode: all is forgotten but what votes put in force. Before the first vote of a world, that
-    is the first choice of each ballot."""
+    """Let institutions forget the last episode, except for the results of votes.
+
+    Before the first vote of a world, the first choice of each ballot is in force.
+    """
     if law is None:
         return
     forget_episode(law.ledger)
@@ -222,7 +237,7 @@ def begin_institutions(world: Worlds, law: Law | None) -> None:
 
 
 def refresh_institutions(world: Worlds, law: Law | None) -> None:
-    """Write what follows from the rest of the memory and from the stock, without events."""
+    """Compute what institutions derive from the state of the world, and clear the events of a turn."""
     if law is not None:
         refresh(law, world.stock)
         forget_turn(law.ledger)
@@ -234,7 +249,7 @@ def stock_share(world: Worlds) -> float:
 
 
 def pursue_violations(world: Worlds, law: Law | None) -> None:
-    """Detect violations of this turn, or not, and let those who are found out pay and miss turns."""
+    """Detect violations of this turn by chance; detected agents pay fines and may miss turns."""
     if law is None:
         return
     for i in range(world.row.shape[0]):
@@ -249,7 +264,8 @@ def pursue_violations(world: Worlds, law: Law | None) -> None:
 
 
 def write_payments(world: Worlds, tables: Tables, law: Law | None, output: StepOutput) -> None:
-    """Write what institutions took, gave and counted in this turn, the reward, and what agents are shown."""
+    """Write the fines, transfers and counts of institutions, the rewards after them, and what agents observe
+    of institutions."""
     if law is None:
         return
     ledger = law.ledger

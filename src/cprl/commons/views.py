@@ -1,12 +1,14 @@
-"""The picture of the board, and the windows that agents observe of it, on one world.
+"""The picture of the board, and the observations that agents have of it. The rules work on one world.
 
-The picture is a function of the world's state alone, so it can be drawn again at any time.
+The picture holds a paint for each cell, which is a colour together with a class. It follows from the state of
+the world alone, so it can be drawn again at any time. A window is the part of the picture that an agent
+observes.
 
-Institutions add planes to agents' observations, after the channels of cells. A plane "forbidden" is 255 on
-the cells of the window where a bite of the agent would break a rule about places. Planes "institutions" hold
-what each module's `shown` gives, in 0..255: with S entries, cell n of the planes, row by row, shows
-entry n modulo S. So a single entry fills a plane evenly, as is usual for numbers that convolutions read
-beside a board. Planes "scoreboard" and "stock_gauge" of `Observation` do the same, before them.
+An observation has further planes after the channels of cells. The planes "scoreboard" and "stock_gauge" are
+described in `Observation`. The plane "forbidden" is 255 on the cells where a harvest would break a rule about
+places. The planes "institutions" hold the values of `cprl.institutions.hooks.shown_value`, scaled to 0..255:
+with S entries, cell n of these planes, counted row by row, shows entry n modulo S. So a single entry fills a
+plane evenly, as is usual for numbers that convolutions read beside a board.
 """
 
 from __future__ import annotations
@@ -33,8 +35,8 @@ from cprl.commons.headings import COL_STEP, ROW_STEP
 from cprl.commons.moves import cell_of
 from cprl.commons.quirks import mark_ahead, paints_over, self_stays, shows_apple
 from cprl.commons.river import is_cleaning
-from cprl.institutions.hooks import forbids, shown
-from cprl.values.arrays import Int32, UInt8
+from cprl.institutions.hooks import forbids, shown_value
+from cprl.values.array_types import Int32, UInt8
 
 if TYPE_CHECKING:
     from cprl.commons.river import Arrays as River
@@ -43,8 +45,9 @@ if TYPE_CHECKING:
     from cprl.institutions import Law
 
 CLASS_SHIFT = 24
-"""A paint is a colour in 24 bits, and its class from this bit on."""
+"""The lowest bit of the class in a paint; the 24 bits below hold the colour."""
 LARGEST_CLASS = 255
+"""The largest class that fits into a paint."""
 
 
 def class_of(paint: int) -> int:
@@ -53,17 +56,19 @@ def class_of(paint: int) -> int:
 
 
 def paint_apples(world: Worlds, tables: Tables, picture: Int32) -> None:
-    """Paint ground, walls, the river and apples; `picture`: int32 [cells], paints.
+    """Paint ground, walls, the river and apples; `picture`: int32 [cells].
 
-    The rim's rows, most of the picture of a small board, stay as `empty_scratch` painted them.
+    The rows of the rim, which are most of the picture of a small board, stay as `empty_scratch` painted them.
     """
-    above = tables.rim * tables.stride
-    below = picture.shape[0] - above
-    board, background = picture[above:below], tables.background[above:below]
+    board_begin = tables.rim * tables.stride
+    board_end = picture.shape[0] - board_begin
+    board = picture[board_begin:board_end]
+    background = tables.background[board_begin:board_end]
     for cell in range(board.shape[0]):
         board[cell] = background[cell]
     paint_waste(tables, world.groups.river, picture)
-    apple, ground = tables.paints[APPLE], tables.paints[GROUND]
+    apple = tables.paints[APPLE]
+    ground = tables.paints[GROUND]
     for k in range(world.stock.shape[0]):
         picture[tables.site_cell[k]] = apple if shows_apple(world, world.groups.quirks, k) else ground
 
@@ -77,7 +82,7 @@ def paint_waste(tables: Tables, river: River | None, picture: Int32) -> None:
 
 
 def has_apple_ahead(world: Worlds, tables: Tables, i: int) -> bool:
-    """Return whether the cell ahead of agent i holds an apple in the picture, under whatever covers it."""
+    """Return whether the picture has an apple on the cell ahead of agent i, even if something covers it."""
     heading = world.heading[i]
     cell = cell_of(world.row[i] + ROW_STEP[heading], world.col[i] + COL_STEP[heading], tables)
     site = tables.site_at[cell]
@@ -85,7 +90,7 @@ def has_apple_ahead(world: Worlds, tables: Tables, i: int) -> bool:
 
 
 def mark_cell(world: Worlds, tables: Tables, i: int) -> int:
-    """Return the cell of agent i's heading mark."""
+    """Return the cell on which agent i's heading mark is painted."""
     heading = world.heading[i]
     ahead = mark_ahead(heading, world.groups.quirks)
     row = world.row[i] + ahead * ROW_STEP[heading]
@@ -94,13 +99,13 @@ def mark_cell(world: Worlds, tables: Tables, i: int) -> int:
 
 
 def is_open_ground(kind: int) -> bool:
-    """Return whether a class is ground that marks and beams cover: ground, or clean water."""
+    """Return whether marks and beams cover cells of a class: ground and clean water."""
     return kind in (GROUND, WATER)
 
 
 def paint_mark(world: Worlds, tables: Tables, i: int, picture: Int32) -> None:
-    """Paint the heading mark of agent i: on ground only, under `Quirks2019.paint_over` on anything but a
-    wall."""
+    """Paint the heading mark of agent i, only on open ground, or under `Quirks2019.paint_over` on anything
+    but a wall."""
     cell = mark_cell(world, tables, i)
     kind = class_of(picture[cell])
     if is_open_ground(kind) or (paints_over(world.groups.quirks) and kind != WALL):
@@ -108,8 +113,8 @@ def paint_mark(world: Worlds, tables: Tables, i: int, picture: Int32) -> None:
 
 
 def paint_beam(world: Worlds, tables: Tables, shooter: int, kind_of_beam: int, picture: Int32) -> None:
-    """Paint the beam of a shooter, BEAM or CLEANING: over ground and marks only, under
-    `Quirks2019.paint_over` over everything."""
+    """Paint the beam of a shooter, only over open ground and marks, or under `Quirks2019.paint_over` over
+    everything; `kind_of_beam`: BEAM or CLEANING."""
     for side in range(-tables.beam_half_width, tables.beam_half_width + 1):
         last = beam_reach(world, tables, shooter, side, world.on_board)
         for ahead in range(beam_begin(tables, side), last + 1):
@@ -137,7 +142,7 @@ def paint_agents(world: Worlds, tables: Tables, picture: Int32) -> None:
 
 
 def paint_beams(world: Worlds, tables: Tables, picture: Int32) -> None:
-    """Paint what agents fired, and with what they cleaned."""
+    """Paint the beams with which agents fired, and those with which they cleaned."""
     for i in range(world.row.shape[0]):
         if world.fired[i]:
             paint_beam(world, tables, i, BEAM, picture)
@@ -146,7 +151,7 @@ def paint_beams(world: Worlds, tables: Tables, picture: Int32) -> None:
 
 
 def paint_agents_over(world: Worlds, tables: Tables, picture: Int32) -> None:
-    """[run] Paint mark and body of each agent in the order of indices, covering others; beams cover all."""
+    """Paint as the program of 2019 does: each agent's mark and body cover earlier ones, beams cover all."""
     for i in range(world.row.shape[0]):
         if world.on_board[i]:
             paint_mark(world, tables, i, picture)
@@ -164,7 +169,7 @@ def paint(world: Worlds, tables: Tables, picture: Int32) -> None:
 
 
 def look(world: Worlds, tables: Tables, i: int, scratch: Scratch) -> None:
-    """Write what agent i sees of the picture into `scratch.seen`: farthest row and leftmost column first."""
+    """Copy the part of the picture that agent i observes into `scratch.seen`, the farthest row first."""
     heading = world.heading[i]
     origin = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
     to_cell = tables.window_cells[heading]
@@ -173,12 +178,12 @@ def look(world: Worlds, tables: Tables, i: int, scratch: Scratch) -> None:
 
 
 def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: UInt8) -> None:
-    """Write the observation of agent i: uint8 [C, X, Y]; in a window it is in the middle of the last row,
-    but for `window_rows_behind`.
+    """Write the observation of agent i into `window`, uint8 [C, X, Y].
 
-    There are two passes, so that the second writes contiguous memory; unsigned indices avoid Numba's check
-    for negative ones. Together this is three times as fast as one plain loop (`benchmarks/env_steps.py`).
+    The agent itself is in the middle of the last row, or `window_rows_behind` rows above that.
     """
+    # Two passes, so that the second writes contiguous memory, and unsigned indices in `look`, so that Numba
+    # does not check for negative ones: three times as fast as a plain loop (`benchmarks/env_steps.py`).
     look(world, tables, i, scratch)
     cells = tables.window_cells.shape[1]
     planes = window.reshape(-1)
@@ -197,16 +202,16 @@ def cut_window(world: Worlds, tables: Tables, i: int, scratch: Scratch, window: 
 
 
 def draw_windows(world: Worlds, tables: Tables, scratch: Scratch, observation: UInt8) -> None:
-    """Write every agent's observation, itself shown as SELF; `observation`: uint8 [N, C, X, Y]."""
+    """Write the observations of all agents, each sees itself as SELF; `observation`: uint8 [N, C, X, Y]."""
     picture = scratch.picture
     paint(world, tables, picture)
     for i in range(world.row.shape[0]):
         cell = cell_of(world.row[i], world.col[i], tables)
-        as_others_see_it = picture[cell]
+        paint_for_others = picture[cell]
         picture[cell] = tables.paints[SELF]
         cut_window(world, tables, i, scratch, observation[i])
         if not self_stays(world.groups.quirks):
-            picture[cell] = as_others_see_it
+            picture[cell] = paint_for_others
 
 
 def draw_board(world: Worlds, tables: Tables, scratch: Scratch, board: UInt8) -> None:
@@ -218,8 +223,11 @@ def draw_board(world: Worlds, tables: Tables, scratch: Scratch, board: UInt8) ->
 
 
 def draw_signals(world: Worlds, tables: Tables, scratch: Scratch, observation: UInt8) -> None:
-    """Write who sent which signal in the last turn, after `draw_windows`, onto whose picture it writes the
-    numbers of signals: no paint is as small; `observation`: uint8 [N, C, X, Y]."""
+    """Write a plane for each signal, with the agents that sent it in the last turn.
+
+    `observation`: uint8 [N, C, X, Y]. This runs after `draw_windows` and writes the numbers of signals over
+    the agents in the picture. No paint is one of these small numbers, so they cannot be mistaken for paints.
+    """
     picture = scratch.picture
     for i in range(world.row.shape[0]):
         if world.on_board[i] and world.signal[i] > 0:
@@ -235,12 +243,16 @@ def draw_signals(world: Worlds, tables: Tables, scratch: Scratch, observation: U
 
 
 HIGHEST = 255
+"""The largest value in the planes of scores and institutions."""
 
 
 def draw_scores(world: Worlds, tables: Tables, observation: UInt8) -> None:
-    """Write the scoreboard and the stock gauge as planes, see `Observation`; `observation`: uint8
-    [N, C, X, Y]."""
-    agents, sites = world.row.shape[0], world.stock.shape[0]
+    """Write the planes of the scoreboard and of the stock gauge, see `Observation`.
+
+    `observation`: uint8 [N, C, X, Y].
+    """
+    agents = world.row.shape[0]
+    sites = world.stock.shape[0]
     end = tables.score_begin + tables.scoreboard_cells
     stock = in_bytes(world.stock_left[0], sites)
     for i in range(agents):
@@ -255,12 +267,15 @@ def draw_scores(world: Worlds, tables: Tables, observation: UInt8) -> None:
 
 
 def in_bytes(part: int, whole: int) -> int:
-    """Return a share as 0..255, rounded half up, in integers alone: the same on every device."""
+    """Return the share part / whole as 0..255, rounded half up.
+
+    Integers alone are used, so that the result is the same on every device.
+    """
     return (2 * HIGHEST * part + whole) // (2 * whole)
 
 
 def draw_institutions(world: Worlds, tables: Tables, law: Law, observation: UInt8) -> None:
-    """Write what institutions show each agent; `observation`: uint8 [N, C, X, Y]."""
+    """Write the planes of institutions; `observation`: uint8 [N, C, X, Y]."""
     cells = tables.window_cells.shape[1]
     for i in range(world.row.shape[0]):
         planes = observation[i].reshape(-1)
@@ -273,7 +288,7 @@ def draw_institutions(world: Worlds, tables: Tables, law: Law, observation: UInt
 
 
 def draw_forbidden(world: Worlds, tables: Tables, law: Law, i: int, plane: UInt8) -> None:
-    """Draw where agent i sees that its bites would break a rule about places; `plane`: uint8 [X * Y]."""
+    """Write the plane of the cells where a harvest of agent i would break a rule; `plane`: uint8 [X * Y]."""
     origin = 0 if tables.sees_all else cell_of(world.row[i], world.col[i], tables)
     heading = world.heading[i]
     for n in range(plane.shape[0]):
@@ -282,9 +297,10 @@ def draw_forbidden(world: Worlds, tables: Tables, law: Law, i: int, plane: UInt8
 
 
 def draw_entries(law: Law, i: int, turn: int, planes: UInt8) -> None:
-    """Write the entries shown to agent i, each into every S-th cell; `planes`: uint8 [cells]."""
+    """Write the S entries that institutions show agent i, each into every S-th cell; `planes`: uint8, one
+    axis."""
     entries = law.entries.what.shape[0]
     for entry in range(entries):
-        value = int(HIGHEST * min(1.0, max(0.0, shown(law, entry, i, turn))) + 0.5)
+        value = int(HIGHEST * min(1.0, max(0.0, shown_value(law, entry, i, turn))) + 0.5)
         for n in range(entry, planes.shape[0], entries):
             planes[n] = value

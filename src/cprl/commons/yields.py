@@ -1,13 +1,13 @@
-"""What a map can bear: a proven lower bound of its sustainable yield, and for which rules it is proven."""
+"""The sustainable yield of a map: a lower bound on the harvest that lasts for ever, where it is proven."""
 
 from typing import Final
 
 import numpy as np
 
 from cprl.commons.maps import Map
-from cprl.commons.near import growth, kept_rates, sites_around
+from cprl.commons.near import growth, harvest_rates, sites_around
 from cprl.commons.rules import Rules
-from cprl.values.arrays import Float64, Int64
+from cprl.values.array_types import Float64, Int64
 
 PROVEN: Final = frozenset(
     (
@@ -19,22 +19,25 @@ PROVEN: Final = frozenset(
         *("clashes", "river", "quirks"),
     )
 )
-"""The fields of `Rules` for which the bound is proven, but for what `unproven` says, of a river while that is
-clean. A rule
-that lets apples come or go in another way is not among them until somebody has proven it."""
+"""The fields of `Rules` that may have any value in the proof of the bound, except for the case in `unproven`,
+and on boards with a river only while that is clean. Add a new rule about how apples come or go only once its
+bound is proven."""
 
 
 def unproven(rules: Rules) -> list[str]:
-    """Return the names of the rules of a game for which no yield is proven.
+    """Return the names of the rules of a game under which its yield is not proven, in alphabetical order.
 
-    Where nothing grows without apples near, sites that begin without them may stay empty.
+    `first_stock_share` is one of them where nothing grows without apples near: there a site that begins
+    without apples near it may stay empty.
     """
-    may_stay_empty = rules.first_stock_share < 1 and rules.regrow_prob[0] == 0
-    return sorted({*rules.changed} - PROVEN | ({"first_stock_share"} if may_stay_empty else set()))
+    names = {*rules.changed} - PROVEN
+    if rules.first_stock_share < 1 and rules.regrow_prob[0] == 0:
+        names.add("first_stock_share")
+    return sorted(names)
 
 
 def check_proven(rules: Rules) -> None:
-    """Refuse rules for which no yield is proven."""
+    """Raise a ValueError for rules under which no yield is proven."""
     names = unproven(rules)
     if names:
         raise ValueError(
@@ -44,47 +47,60 @@ def check_proven(rules: Rules) -> None:
 
 
 def sustainable_yield(board: Map, rules: Rules) -> float:
-    """Return the apples per turn that can be harvested for ever: a lower bound, proven by a way to reach it.
+    """Return a number of apples per turn that can be harvested for ever; more may be possible.
 
-    Some sites are harvested as soon as they hold an apple, the others never. A harvested site with m
-    unharvested sites near it then grows an apple in every turn in which it is empty with at least the
-    probability p = min(`regrow_prob`[m:]). So it bears p / (1 + p) apples a turn: it stands full for the turn
-    in which it is bitten, except where apples grow before bites, also under agents, where it bears p.
-    Which sites are harvested is found by a greedy search, so more may be possible. An isolated cross under
-    the published probabilities has two harvested sites with three apples near each: 0.1 apples a turn as run.
+    The bound is proven by a way to reach it: agents harvest some sites as soon as they hold an apple, and the
+    others never. A greedy search chooses the harvested sites. A harvested site with m unharvested sites near
+    it grows an apple in every turn in which it is empty, with a probability of at least
+    p = min(`regrow_prob`[m:]). It stands full for the turn in which it is harvested, so it yields p / (1 + p)
+    apples per turn. Where apples grow before harvests, also under agents, it yields p. For example, an
+    isolated cross under the published probabilities has two harvested sites with three apples near each, and
+    yields 0.1 apples per turn in the variant "as_run".
 
-    On a map with a river it is the yield of a clean river, and no bound otherwise.
+    On a map with a river this is the yield while the river is clean, and no bound otherwise.
 
     Raises:
-        ValueError: for rules that are not `PROVEN`.
+        ValueError: for rules outside `PROVEN`.
     """
     check_proven(rules)
     around = sites_around(board, rules)
-    of_site, probs = growth(rules, np.array([len(some) for some in around], np.int32))
-    rates = kept_rates(rules, probs)
-    return _best(np.broadcast_to(rates[of_site], (len(around), rates.shape[1])), around)
+    row_of_site, probs = growth(rules, np.array([len(sites) for sites in around], np.int32))
+    rates = harvest_rates(rules, probs)
+    return _greedy_yield(np.broadcast_to(rates[row_of_site], (len(around), rates.shape[1])), around)
 
 
-def _best(rate: Float64, around: list[Int64]) -> float:
-    """Return the yield of the harvested sites that a greedy search finds: each added while the sum grows.
+_SMALLEST_GAIN: Final = 1e-12
+"""Apples per turn; the greedy search stops at smaller gains, which may be rounding errors."""
 
-    `rate`: [K, counts], what a site bears with so many unharvested sites near it."""
-    sites = len(around)
-    others = np.array([len(some) for some in around])
-    harvested = np.zeros(sites, np.bool_)
+
+def _greedy_yield(rate: Float64, around: list[Int64]) -> float:
+    """Return the yield of the harvested sites that a greedy search finds.
+
+    The search adds the site that raises the yield most, until no site raises it.
+
+    Args:
+        rate: [K, counts], the yield of each site by the number of unharvested sites near it.
+        around: the sites near each site.
+    """
+    site_count = len(around)
+    unharvested_near = np.array([len(near_sites) for near_sites in around])
+    harvested = np.zeros(site_count, np.bool_)
 
     def gain(k: int) -> float:
-        hurt = around[k][harvested[around[k]]]
-        return float(rate[k, others[k]] - (rate[hurt, others[hurt]] - rate[hurt, others[hurt] - 1]).sum())
+        """Return the yield of site k, less the loss of the harvested sites near it, if it is added."""
+        losers = around[k][harvested[around[k]]]
+        counts = unharvested_near[losers]
+        losses = rate[losers, counts] - rate[losers, counts - 1]
+        return float(rate[k, unharvested_near[k]] - losses.sum())
 
-    gains = np.array([gain(k) for k in range(sites)])
+    gains = np.array([gain(k) for k in range(site_count)])
     while True:
         gains[harvested] = 0
         k = int(gains.argmax())
-        if gains[k] <= 1e-12:
-            return float(rate[harvested, others[harvested]].sum())
+        if gains[k] <= _SMALLEST_GAIN:
+            return float(rate[harvested, unharvested_near[harvested]].sum())
         harvested[k] = True
-        others[around[k]] -= 1
-        again = {k, *around[k].tolist(), *(int(j) for i in around[k] for j in around[i])}
-        for site in again:
+        unharvested_near[around[k]] -= 1
+        affected = {k, *around[k].tolist(), *(int(j) for i in around[k] for j in around[i])}
+        for site in affected:
             gains[site] = gain(site)

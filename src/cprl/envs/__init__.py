@@ -1,14 +1,15 @@
-"""Adapters of the same game: TorchRL, PettingZoo, Gymnasium.
+"""Environments: the game behind the interfaces of TorchRL, PettingZoo and Gymnasium.
 
-Modules, in the order in which one reads them:
-    make_env         where an environment is put together; spaces_of; games as recipes hold them
-    commons_env      CommonsEnv, TorchRL: B worlds at once
-    drivers          where the worlds run: CPU threads or a GPU
-    stepping          what environments share in a step: actions, what is carried on
-    unwrap           what lies under an environment's transforms, and what its specs say of agents
-    state            the state of an environment and its transforms, for checkpoints
-    pettingzoo_env   parallel_env and env, one world
-    gymnasium_env    one world of one agent, played by the parallel_env
+Modules, in reading order:
+
+    make_env         make_env builds an environment of any game, with transforms, and checks it
+    commons_env      CommonsEnv: B worlds as one TorchRL environment
+    drivers          chooses where the worlds run: on CPU threads or on a GPU
+    stepping         helpers of a step: read actions, carry entries over to the next turn
+    unwrap           finds the environment under its transforms, its agents and its actions
+    env_state        saves and restores an environment and its transforms, for checkpoints
+    pettingzoo_env   parallel_env and env: one world for PettingZoo
+    gymnasium_env    CommonsGymnasiumEnv: one world with one agent for Gymnasium
 """
 
 from cprl.envs.commons_env import CommonsEnv

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 from math import prod
-from typing import Annotated, Any
+from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
@@ -14,48 +14,55 @@ from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 from cprl import keys, recurrent_state
 from cprl.commons.batch import Batch
 from cprl.commons.game import Game, output_forms
-from cprl.commons.quirks import paints_over
 from cprl.commons.world import PLAYING, StepOutput
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
-from cprl.envs.stepping import carry_on, chosen
+from cprl.envs.stepping import carry_on, read_choices
 from cprl.pictures.image import world_image
-from cprl.system.compat import LeanStepEnv, flag_spec, unchecked_tensordict
+from cprl.system.compat.tensordicts import unchecked_tensordict
+from cprl.system.compat.torchrl import LeanStepEnv, flag_spec
 from cprl.values import Range, Seed, checked
-from cprl.values.arrays import UInt8
+from cprl.values.array_types import UInt8
 
-WORLD_ENTRIES = ("stock", "regrown")
-DONE_ENTRIES = ("done", "terminated", "truncated")
-_AGENT_ENTRIES = ("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by")
-_AHEAD_BYTES = 2**16
-"""Below this size, memory is allocated for sixteen turns at once: an allocation takes as long as a world."""
-_AHEAD_TURNS = 16
-_BALLOT_ENTRIES = (keys.IN_FORCE, keys.BALLOTS_DUE)
-_PAID_ENTRIES = tuple(key[-1] for key in (keys.FINES, keys.TRANSFERS, keys.VIOLATED, keys.COUNTS))
-"""Entries of agents in games with institutions."""
-_REPLACED = frozenset((*StepOutput._fields, keys.STATE, keys.AGENTS, "next", "_reset"))
-"""The entries that the environment writes anew in each turn."""
+_AGENT_ENTRIES: Final = (
+    *("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by"),
+    *("cleaned", "apple_ahead", "fines", "transfers", "violated", "counts"),
+)
+_WORLD_ENTRIES: Final = ("stock", "regrown", "waste", "in_force", "ballots_due")
+_DONE_ENTRIES: Final = ("done", "terminated", "truncated")
+"""The entries per agent, per world, and those that say whether the episode has ended. A game whose rules
+never fill an entry leaves it out."""
+_SMALL_OUTPUT_BYTES: Final = 2**16
+"""Outputs smaller than this are allocated for several turns at once: one allocation takes as long as playing
+a turn of one world."""
+_TURNS_PER_ALLOCATION: Final = 16
+"""The number of turns whose small outputs share one allocation."""
+_WRITTEN_ENTRIES: Final = frozenset((*StepOutput._fields, keys.STATE, keys.AGENTS, "next", "_reset"))
+"""The entries that the environment writes in every turn; all others are carried over from the turn before."""
 
 
 class CommonsEnv(LeanStepEnv):
-    """B worlds of a game, batch size [B], all agents in the group "agents"; entries as in `cprl.keys`.
+    """B worlds of a game as one TorchRL environment with batch size [B] and all agents in the group "agents".
 
-    Dones are at the root only. Stepping a world that has ended does not change it. Every step writes to new
-    tensors, so that a TensorDict from an earlier step never changes.
+    `cprl.keys` describes the entries. "done", "terminated" and "truncated" are at the root only. Stepping a
+    world whose episode has ended does not change that world. Every step writes to new tensors, so a
+    TensorDict from an earlier step never changes.
 
     Args:
-        seed: the seed of all random numbers; `set_seed` restarts from another. None draws one from torch's
-            generator, a different one in each worker process: environments that TorchRL's `ParallelEnv`,
-            `SerialEnv` or a collector makes by the same call have different worlds.
-        device: "cpu", or "cuda" with a GPU and the package numba-cuda; worlds and all outputs stay there.
-        threads: the number of CPU threads that share the worlds; None for all cores if that is faster.
-        first_world: the index of the first world: `CommonsEnv(game, 1, first_world=b)` plays the same as
-            world b of a larger batch.
+        worlds: the number of worlds B.
+        seed: the seed of all random numbers; `set_seed` restarts from another seed. None draws a seed from
+            torch's generator, a different one in each worker process, so that the environments that TorchRL's
+            `ParallelEnv`, `SerialEnv` or a collector makes by the same call have different worlds.
+        device: "cpu", or "cuda" with a GPU and the package numba-cuda. The worlds and all outputs stay on
+            this device.
+        threads: the number of CPU threads that share the worlds; None uses all cores where that is faster.
+        first_world: the index of the first world: `CommonsEnv(game, 1, first_world=b)` plays the same
+            episodes as world b of a larger batch.
         state: whether outputs include the whole board as "state", uint8 [B, 3, H, W].
 
     Raises:
-        ValueError: if a number is out of range, for the device "cuda" if torch or Numba finds no GPU, and, in
-            `step`, for actions that are missing, unknown or of another form (int64 [B, N]; other integers are
-            converted); then nothing changes.
+        ValueError: if an argument is out of range, or if the device is "cuda" and torch or Numba finds no
+            GPU. `step` raises it for actions that are missing, unknown, or not int64 [B, N] (other integer
+            types are converted); the worlds are then unchanged.
         MemoryError: if the worlds do not fit into memory.
     """
 
@@ -75,108 +82,130 @@ class CommonsEnv(LeanStepEnv):
         device = device_of(device)
         driver, as_array = driver_for(game, worlds, device, threads)
         super().__init__(device=device, batch_size=torch.Size([worlds]))
-        self.game, self._as_array = game, as_array
+        self.game = game
+        self._as_array = as_array
         seed = drawn_seed() if seed is None else seed
         self.worlds = Batch(game, worlds, seed=seed, first_world=first_world, driver=driver)
         self.group_map = {keys.AGENTS: list(game.agent_names)}
         self.n_agents = game.agents
-        self._size = worlds
+        self._world_count = worlds
         self._agents_size = torch.Size([worlds, game.agents])
-        paid = _PAID_ENTRIES if game.institutions else ()
-        covered = keys.APPLE_AHEAD[1:] if paints_over(game.rules.quirks) else ()
-        of_agents, of_worlds = (keys.CLEANED[1:], (keys.WASTE,)) if game.map.river else ((), ())
-        self._agent_entries = (*_AGENT_ENTRIES, *of_agents, *covered, *paid)
-        self._world_entries = (*WORLD_ENTRIES, *of_worlds, *(_BALLOT_ENTRIES if game.ballots else ()))
-        self._decides = game.decisions > 0
-        self._with_state = state
+        self._has_decisions = game.decisions > 0
+        self._has_state = state
+        self._colours = torch.from_numpy(game.palette).to(device)
+        self._plan_outputs()
+        self._tensors: dict[str, Tensor]
+        self.output: StepOutput
+        self._set_output(*self._new_output())
+        self._make_specs()
+
+    def _plan_outputs(self) -> None:
+        """Prepare how memory for outputs is allocated, and which entries the game has."""
         self._forms = {
             name: (shape, torch.from_numpy(np.empty(0, dtype)).dtype)
-            for name, (shape, dtype) in output_forms(game, worlds).items()
+            for name, (shape, dtype) in output_forms(self.game, self._world_count).items()
         }
-        self._colours = torch.from_numpy(game.palette).to(device)
-        output_bytes = sum(prod(shape) * dtype.itemsize for shape, dtype in self._forms.values())
-        self._lacking = {
-            name: as_array(torch.empty(shape, dtype=dtype, device=device))
+        self._empty_arrays = {
+            name: self._as_array(torch.empty(shape, dtype=dtype, device=self.device))
             for name, (shape, dtype) in self._forms.items()
             if not prod(shape)
         }
-        """The arrays, in every turn, of entries that the game lacks: made anew they would take as long as a
-        world."""
-        self._turns_ahead = _AHEAD_TURNS if output_bytes < _AHEAD_BYTES else 1
-        self._ahead: list[tuple[dict[str, Tensor], StepOutput]] = []
-        self._tensors: dict[str, Tensor]
-        self.output: StepOutput
-        self._show_in(*self._fresh())
-        self._make_specs()
+        """The arrays of length 0 of the entries that the game lacks. They serve every turn, since making new
+        ones would take as long as playing a turn of one world."""
+        self._agent_entries = [name for name in _AGENT_ENTRIES if name not in self._empty_arrays]
+        self._world_entries = [name for name in _WORLD_ENTRIES if name not in self._empty_arrays]
+        output_bytes = sum(prod(shape) * dtype.itemsize for shape, dtype in self._forms.values())
+        self._allocated_turns = _TURNS_PER_ALLOCATION if output_bytes < _SMALL_OUTPUT_BYTES else 1
+        self._unused_outputs: list[tuple[dict[str, Tensor], StepOutput]] = []
 
     def _make_specs(self) -> None:
-        game, worlds, per_agent = self.game, self._size, self._agents_size
-        highest = {"observation": game.observation_highest, "harvest": 1}
-        highest |= dict.fromkeys(WORLD_ENTRIES, len(game.map.sites)) | {"waste": len(game.map.river)}
-        highest |= {"cleaned": game.rules.beam_width_cells}
+        """Set the specs of actions, observations, rewards and dones."""
+        game = self.game
+        choice_counts = {"action": len(game.actions)}
+        if self._has_decisions:
+            choice_counts["decision"] = game.decisions
+        choices = {
+            name: Categorical(count, shape=self._agents_size, dtype=torch.int64)
+            for name, count in choice_counts.items()
+        }
+        self.action_spec = self._group_spec(choices)
+        root_specs = self._entry_specs(self._world_entries)
+        if self._has_state:
+            board = self._world_count, 3, game.map.height, game.map.width
+            root_specs[keys.STATE] = Bounded(0, 255, shape=board, dtype=torch.uint8)
+        self.observation_spec = self._group_spec(self._entry_specs(self._agent_entries), **root_specs)
+        reward = Unbounded(shape=(*self._agents_size, 1), dtype=torch.float32)
+        self.reward_spec = self._group_spec({"reward": reward})
+        self.done_spec = Composite(self._entry_specs(_DONE_ENTRIES), shape=(self._world_count,))
 
-        def specs(names: Iterable[str]) -> dict[str, TensorSpec]:
-            return {name: spec(name, *self._forms[name]) for name in names}
+    def _group_spec(self, agent_specs: Mapping[str, TensorSpec], **root_specs: TensorSpec) -> Composite:
+        """Return the spec of entries in the group "agents" and of entries at the root."""
+        agents = Composite(dict(agent_specs), shape=self._agents_size)
+        return Composite(agents=agents, **root_specs, shape=(self._world_count,))
 
-        def spec(name: str, shape: tuple[int, ...], dtype: torch.dtype) -> TensorSpec:
+    def _entry_specs(self, names: Iterable[str]) -> dict[str, TensorSpec]:
+        """Return the spec of each of these entries of `StepOutput`."""
+        game = self.game
+        highest = {
+            "observation": game.observation_highest,
+            "harvest": 1,
+            "stock": len(game.map.sites),
+            "regrown": len(game.map.sites),
+            "waste": len(game.map.river),
+            "cleaned": game.rules.beam_width_cells,
+        }
+        specs: dict[str, TensorSpec] = {}
+        for name in names:
+            shape, dtype = self._forms[name]
             if dtype is torch.bool:
-                return flag_spec(*shape)
-            if name in highest:
-                return Bounded(0, highest[name], shape=shape, dtype=dtype)
-            return Unbounded(shape=shape, dtype=dtype)
-
-        def group(of_agents: dict[str, TensorSpec], **of_worlds: TensorSpec) -> Composite:
-            return Composite(agents=Composite(of_agents, shape=per_agent), **of_worlds, shape=(worlds,))
-
-        choices = {"action": len(game.actions), **({"decision": game.decisions} if self._decides else {})}
-        self.action_spec = group(
-            {name: Categorical(count, shape=per_agent, dtype=torch.int64) for name, count in choices.items()}
-        )
-        of_worlds = specs(self._world_entries)
-        if self._with_state:
-            board = worlds, 3, game.map.height, game.map.width
-            of_worlds[keys.STATE] = Bounded(0, 255, shape=board, dtype=torch.uint8)
-        self.observation_spec = group(specs(self._agent_entries), **of_worlds)
-        self.reward_spec = group({"reward": Unbounded(shape=(*per_agent, 1), dtype=torch.float32)})
-        self.done_spec = Composite(specs(DONE_ENTRIES), shape=(worlds,))
+                specs[name] = flag_spec(*shape)
+            elif name in highest:
+                specs[name] = Bounded(0, highest[name], shape=shape, dtype=dtype)
+            else:
+                specs[name] = Unbounded(shape=shape, dtype=dtype)
+        return specs
 
     def __repr__(self) -> str:
-        return f"CommonsEnv({self.game!r}, worlds={self._size}, device={str(self.device)!r})"
+        return f"CommonsEnv({self.game!r}, worlds={self._world_count}, device={str(self.device)!r})"
 
-    def _fresh(self) -> tuple[dict[str, Tensor], StepOutput]:
-        """New memory for the output of a turn: as tensors by name, and the same memory as arrays."""
-        if not self._ahead:
-            blocks = {
-                name: torch.empty((self._turns_ahead, *shape), dtype=dtype, device=self.device)
-                for name, (shape, dtype) in self._forms.items()
-                if name not in self._lacking
-            }
-            tensors = zip(*(block.unbind() for block in blocks.values()), strict=True)
-            arrays = zip(*(self._turns_of(blocks, name) for name in self._forms), strict=True)
-            for turn, output in zip(tensors, arrays, strict=True):
-                self._ahead.append((dict(zip(blocks, turn, strict=True)), StepOutput(*output)))
-        return self._ahead.pop()
+    def _new_output(self) -> tuple[dict[str, Tensor], StepOutput]:
+        """Return new memory for the output of one turn, as tensors by name and as arrays that share it."""
+        if not self._unused_outputs:
+            self._allocate_outputs()
+        return self._unused_outputs.pop()
 
-    def _show_in(self, tensors: dict[str, Tensor], output: StepOutput) -> None:
-        """Set the memory of the current output; faster than through attributes of a module."""
-        object.__setattr__(self, "_tensors", tensors)
-        object.__setattr__(self, "output", output)
+    def _allocate_outputs(self) -> None:
+        """Allocate the outputs of the next turns; small ones for several turns at once."""
+        blocks = {
+            name: torch.empty((self._allocated_turns, *shape), dtype=dtype, device=self.device)
+            for name, (shape, dtype) in self._forms.items()
+            if name not in self._empty_arrays
+        }
+        tensors_by_turn = zip(*(block.unbind() for block in blocks.values()), strict=True)
+        arrays_by_turn = zip(*(self._block_arrays(blocks, name) for name in self._forms), strict=True)
+        for tensors, arrays in zip(tensors_by_turn, arrays_by_turn, strict=True):
+            self._unused_outputs.append((dict(zip(blocks, tensors, strict=True)), StepOutput(*arrays)))
 
-    def _turns_of(self, blocks: Mapping[str, Tensor], name: str) -> Any:
-        """Return the turns of a block as arrays."""
-        if name in self._lacking:
-            return [self._lacking[name]] * self._turns_ahead
+    def _block_arrays(self, blocks: Mapping[str, Tensor], name: str) -> Any:
+        """Return the arrays of one entry, one for each turn of an allocated block."""
+        if name in self._empty_arrays:
+            return [self._empty_arrays[name]] * self._allocated_turns
         block = blocks[name]
         on_cpu = block.device.type == "cpu"
         return block.numpy() if on_cpu else [self._as_array(turn) for turn in block.unbind()]
 
+    def _set_output(self, tensors: dict[str, Tensor], output: StepOutput) -> None:
+        """Set the memory of the current output, past the slow `__setattr__` of torch modules."""
+        object.__setattr__(self, "_tensors", tensors)
+        object.__setattr__(self, "output", output)
+
     def _as_tensordict(self, tensors: dict[str, Tensor], reward: Tensor | None = None) -> TensorDict:
-        """Return the entries of one time step; without a reward, as `reset` returns them."""
+        """Return one time step as a TensorDict, without a reward as `reset` returns it."""
         agents = {name: tensors[name] for name in self._agent_entries}
         if reward is not None:
             agents["reward"] = reward
-        entries: dict[str, Any] = {name: tensors[name] for name in (*self._world_entries, *DONE_ENTRIES)}
-        if self._with_state:
+        entries: dict[str, Any] = {name: tensors[name] for name in (*self._world_entries, *_DONE_ENTRIES)}
+        if self._has_state:
             boards = torch.as_tensor(self.worlds.boards(self.output), device=self.device)
             entries[keys.STATE] = self._colours[boards.long()].permute(0, 3, 1, 2)
         entries[keys.AGENTS] = unchecked_tensordict(agents, self._agents_size, self.device)
@@ -184,54 +213,62 @@ class CommonsEnv(LeanStepEnv):
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Restart from a seed, 0 to 2**64 - 1; see `EnvBase.set_seed`."""
-        following: int | None = super().set_seed(checked("seed", seed, Seed | None), static_seed)
-        return following
+        next_seed: int | None = super().set_seed(checked("seed", seed, Seed | None), static_seed)
+        return next_seed
 
     def _set_seed(self, seed: int | None) -> None:
-        self.worlds.set_seed(drawn_seed() if seed is None else seed)
+        seed = drawn_seed() if seed is None else seed
+        self.worlds.set_seed(seed)
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDict:
-        which = None if tensordict is None else tensordict.get("_reset", None)
-        begun = self._as_tensordict(self._begin(which))
+        reset_worlds = None if tensordict is None else tensordict.get("_reset", None)
+        reset_td = self._as_tensordict(self._begin(reset_worlds))
         if tensordict is not None:
-            recurrent_state.carry(begun, tensordict, which)
-        return begun
+            recurrent_state.carry(reset_td, tensordict, reset_worlds)
+        return reset_td
 
-    def _begin(self, which: Tensor | None) -> dict[str, Tensor]:
-        """Start the next episode of the marked worlds (bool [B, 1]; None for all), in new tensors."""
-        before = self._tensors
-        self._show_in(*self._fresh())
-        if which is None:
+    def _begin(self, reset_worlds: Tensor | None) -> dict[str, Tensor]:
+        """Begin the next episode in some worlds, leave the others as they are, and return the new output.
+
+        `reset_worlds`: bool [B, 1], True for worlds that begin; None for all.
+        """
+        previous = self._tensors
+        self._set_output(*self._new_output())
+        if reset_worlds is None:
             self.worlds.begin(self.output)
         else:
             for name, tensor in self._tensors.items():
-                tensor.copy_(before[name])
-            self.worlds.begin(self.output, self._as_array(which.reshape(-1)))
+                tensor.copy_(previous[name])
+            self.worlds.begin(self.output, self._as_array(reset_worlds.reshape(-1)))
         return self._tensors
 
     def load(self, state: Mapping[str, NDArray[Any]]) -> TensorDict:
-        """Set all worlds to a state, and return their entries as `reset` does.
+        """Set all worlds to a saved state, and return the TensorDict that `reset` would return there.
 
-        The events of the turn before are not told: harvest, fired, hit_by, tagged_by, regrown, and of
-        institutions fines, transfers and violated are 0 and false, also where windows show the beam of an
-        agent whose "fired" in the state is true.
+        A state does not hold the events of the step before it: harvest, fired, hit_by, tagged_by, regrown,
+        and with institutions fines, transfers and violated are 0 and False, although the windows may still
+        show a beam.
 
         Args:
-            state: a value of `env.worlds.state()`: arrays by name, for as many worlds of the same game.
+            state: a result of `env.worlds.state()`, arrays by name, of the same game and number of worlds.
 
         Raises:
-            ValueError: if the state is impossible; worlds are then unchanged.
+            ValueError: if the state is impossible; the worlds are then unchanged.
         """
-        tensors, output = self._fresh()
+        tensors, output = self._new_output()
         self.worlds.load(state, output)
-        self._show_in(tensors, output)
+        self._set_output(tensors, output)
         return self._as_tensordict(tensors)
 
     def render(self, *, world: int | None = None, cell_pixels: int = 24) -> UInt8:
-        """Images of the boards as they are now, e.g. for TorchRL's `PixelRenderTransform`.
+        """Return images of the current boards, e.g. for TorchRL's `PixelRenderTransform`.
+
+        Args:
+            world: the index of the only world to draw; None draws all of them.
+            cell_pixels: the width and height of a cell in pixels.
 
         Returns:
-            A numpy array, uint8 [B, rows, columns, 3] in RGB; of one `world` uint8 [rows, columns, 3].
+            A numpy array in RGB: uint8 [rows, columns, 3] for one world, uint8 [B, rows, columns, 3] for all.
         """
         batch = self.worlds
         if not batch.has_begun:
@@ -242,52 +279,63 @@ class CommonsEnv(LeanStepEnv):
         if world is not None:
             world = checked("world", world, Annotated[int, Range(0, batch.size - 1)])
             return world_image(board, batch.show(self.output, world=world), cell_pixels=cell_pixels)
-        states = (batch.show(self.output, world=number) for number in range(batch.size))
-        return np.stack([world_image(board, one, cell_pixels=cell_pixels) for one in states])
+        views = (batch.show(self.output, world=index) for index in range(batch.size))
+        return np.stack([world_image(board, view, cell_pixels=cell_pixels) for view in views])
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        actions = self._as_array(self._chosen(tensordict, "action"))
+        actions = self._as_array(self._read_choices(tensordict, "action"))
         self.worlds.check(actions)
         decisions = None
-        if self._decides:
-            decisions = self._as_array(self._chosen(tensordict, "decision"))
+        if self._has_decisions:
+            decisions = self._as_array(self._read_choices(tensordict, "decision"))
             self.worlds.check_decisions(decisions)
-        stepped = tensordict.get("_step", None)
-        if stepped is not None:
-            self._check_stepped(stepped.reshape(-1))
-        self._show_in(*self._fresh())
+        step_mask = tensordict.get("_step", None)
+        if step_mask is not None:
+            self._check_step_mask(step_mask.reshape(-1))
+        self._set_output(*self._new_output())
         self.worlds.play(actions, self.output, decisions)
         return self._as_tensordict(self._tensors, self._tensors["reward"].unsqueeze(-1))
 
-    def _check_stepped(self, stepped: Tensor) -> None:
-        """That the worlds that a "_step" mask, bool [B], leaves out have all ended."""
+    def _check_step_mask(self, step_mask: Tensor) -> None:
+        """Refuse a "_step" mask, bool [B], that leaves out a world whose episode has not ended."""
         playing = self.worlds.driver.read(self.worlds.now.ended)[:, 0] == PLAYING
-        left_out = playing & ~stepped.numpy(force=True)
+        left_out = playing & ~step_mask.numpy(force=True)
         if left_out.any():
             raise ValueError(
                 f'"_step" leaves out world {int(left_out.argmax())}, which is playing; allowed: masks that '
                 "leave out worlds that have ended, since all others play every turn together"
             )
 
-    def _chosen(self, tensordict: TensorDictBase, name: str) -> Tensor:
-        return chosen(tensordict, name, self._agents_size, self.device).contiguous()
+    def _read_choices(self, tensordict: TensorDictBase, name: str) -> Tensor:
+        """Return ("agents", "action") or ("agents", "decision") as contiguous int64 [B, N]."""
+        return read_choices(tensordict, name, self._agents_size, self.device).contiguous()
 
     def _any_done(self) -> bool:
-        """Return whether any world has ended; numpy counts in a tenth of the time that torch takes."""
+        """Return whether the episode of any world has ended."""
         done = self.output.done
-        return bool(np.count_nonzero(done) if isinstance(done, np.ndarray) else self._tensors["done"].any())
+        if isinstance(done, np.ndarray):  # numpy takes a tenth of torch's time to count so few numbers
+            return bool(np.count_nonzero(done))
+        return bool(self._tensors["done"].any())
 
     def lean_step(
         self, tensordict: TensorDictBase, *, resets: bool = True
     ) -> tuple[TensorDictBase, TensorDictBase]:
-        """Do the same as `EnvBase.step_and_maybe_reset`, without its handling of keys.
+        """Play one turn like `EnvBase.step_and_maybe_reset`, without the slow handling of keys in TorchRL.
 
-        A test checks that they are equal, including the entries of policies. Without `resets` worlds that
-        have ended stay as they are.
+        A test checks that both give equal results, including the entries that policies wrote.
+
+        Args:
+            tensordict: the input of this turn; its result is stored in it as "next".
+            resets: whether worlds whose episode ends begin the next one; otherwise they stay as they are.
+
+        Returns:
+            `tensordict`, and the input of the next turn.
         """
-        following = self._step(tensordict)
-        keys.put(tensordict, "next", following)
+        keys.put(tensordict, "next", self._step(tensordict))
         done = self._tensors["done"]
-        carried = self._as_tensordict(self._begin(done) if resets and self._any_done() else self._tensors)
-        carry_on(carried, tensordict, done if resets else None, _REPLACED)
-        return tensordict, carried
+        if resets and self._any_done():
+            self._begin(done)
+        next_input = self._as_tensordict(self._tensors)
+        is_first = done if resets else None
+        carry_on(next_input, tensordict, is_first, _WRITTEN_ENTRIES)
+        return tensordict, next_input

@@ -1,4 +1,4 @@
-"""Where the worlds of an environment run, and the seed of one that is given none."""
+"""Choose where the worlds of an environment run, and draw a seed for an environment that is given none."""
 
 import multiprocessing
 from collections.abc import Callable
@@ -9,17 +9,17 @@ import torch
 from torch import Tensor
 
 from cprl.commons.batch import Driver
-from cprl.commons.compiled import PLAIN, RULES_VARIABLE, runs_plain
+from cprl.commons.compiled import PLAIN_RULES, RULES_VARIABLE, runs_plain
 from cprl.commons.game import Game
 from cprl.commons.threads import CpuThreads
 from cprl.values import refusal
 
 
 def drawn_seed() -> int:
-    """Return a seed from torch's generator, for an environment without one.
+    """Draw a seed from torch's generator, a different one in each worker process.
 
-    Forked workers start with equal generators, so in a worker process the seed also depends on the name of
-    the process, which `multiprocessing` makes unique among the children of a process.
+    Forked workers start with equal generators. So the seed of a worker also depends on the name of its
+    process, which `multiprocessing` makes unique among the children of a process.
     """
     drawn = int(torch.empty((), dtype=torch.int64).random_().item())
     if multiprocessing.parent_process() is None:
@@ -29,7 +29,7 @@ def drawn_seed() -> int:
 
 
 def device_of(device: Any) -> torch.device:
-    """Return the device; raises a ValueError if torch knows none of this name."""
+    """Return a device, e.g. of "cuda"; raise a ValueError for a name that torch does not know."""
     try:
         return torch.device(device)
     except (RuntimeError, TypeError, ValueError):
@@ -39,8 +39,12 @@ def device_of(device: Any) -> torch.device:
 def driver_for(
     game: Game, worlds: int, device: torch.device, threads: int | None
 ) -> tuple[Driver, Callable[[Tensor], Any]]:
-    """Return the driver that runs the worlds on a device, and the function that views a tensor as an
-    array."""
+    """Return the driver that runs the worlds on a device, and a function that views a tensor there as an
+    array of the driver, without a copy.
+
+    Raises:
+        ValueError: for a device that the game cannot use, or `threads` with a GPU.
+    """
     if device.type == "cpu":
         return CpuThreads(game, worlds, threads=threads), Tensor.numpy
     if device.type != "cuda":
@@ -49,8 +53,8 @@ def driver_for(
         raise refusal("threads", threads, "None on a GPU, where each world has its own thread")
     if runs_plain():
         raise ValueError(
-            f'device is "{device}" and {RULES_VARIABLE} is "{PLAIN}", or NUMBA_DISABLE_JIT is 1; allowed: '
-            'rules that run as plain Python on "cpu" alone'
+            f'device is "{device}" and {RULES_VARIABLE} is "{PLAIN_RULES}", or NUMBA_DISABLE_JIT is 1; '
+            'allowed: rules that run as plain Python on "cpu" alone'
         )
     if not torch.cuda.is_available():
         raise ValueError(f'device is "{device}"; allowed: "cpu", because torch finds no GPU')

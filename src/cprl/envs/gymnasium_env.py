@@ -1,4 +1,4 @@
-"""Adapter for Gymnasium: games of a single agent.
+"""Adapter for Gymnasium: play games that have a single agent.
 
 Importing `cprl` registers `cprl/SingleBasic-v0`, `cprl/SingleComplex-v0` and, for any game with one agent,
 `cprl/Commons-v0`.
@@ -11,12 +11,14 @@ import gymnasium
 from cprl.commons.game import Game
 from cprl.envs.pettingzoo_env import RENDER_FPS, RENDER_MODES, CommonsParallelEnv
 from cprl.values import Seed, checked
-from cprl.values.arrays import UInt8
+from cprl.values.array_types import UInt8
 
 
 class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
-    """One world of a game with one agent as a Gymnasium `Env`; seeds, render modes, decisions and infos as in
-    `CommonsParallelEnv`, which plays it."""
+    """One world of a game with one agent as a Gymnasium `Env`.
+
+    `CommonsParallelEnv` plays the world: seeds, render modes, decisions and infos are as described there.
+    """
 
     metadata = {  # noqa: RUF012  (as Gymnasium declares it)
         "render_modes": list(RENDER_MODES),
@@ -29,7 +31,8 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
                 f"the game has {game.agents} agents; allowed with Gymnasium: 1; for more use "
                 "cprl.envs.parallel_env (PettingZoo) or CommonsEnv (TorchRL)"
             )
-        self.game, self.render_mode = game, render_mode
+        self.game = game
+        self.render_mode = render_mode
         self.world = CommonsParallelEnv(game, seed=seed, render_mode=render_mode)
         (self.observation_space,) = self.world.observation_spaces.values()
         (self.action_space,) = self.world.action_spaces.values()
@@ -46,11 +49,11 @@ class CommonsGymnasiumEnv(gymnasium.Env[Any, Any]):
         return self.world.observation(0), self.world.info(0)
 
     def step(self, action: int) -> tuple[UInt8, float, bool, bool, dict[str, Any]]:
-        """Play one turn; refuse an action that is no integer or out of range, with the world unchanged."""
+        """Play one turn; raise a ValueError for an unknown action, and leave the world unchanged."""
         world = self.world
         world.play([action])
         return world.observation(0), world.reward(0), world.terminated, world.truncated, world.info(0)
 
     def render(self) -> UInt8:
-        """Return an image, uint8 [rows, columns, 3]; refused without a render mode."""
+        """Return an image of the board, uint8 [rows, columns, 3]; refuse to without a render mode."""
         return self.world.render()

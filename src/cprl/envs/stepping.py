@@ -1,4 +1,4 @@
-"""What environments share in a step: what a policy wrote, and what goes on from turn to turn."""
+"""Helpers of a step that environments share: read actions, and carry entries over to the next turn."""
 
 from typing import Final
 
@@ -7,23 +7,27 @@ from tensordict import TensorDictBase
 from torch import Tensor
 
 from cprl import keys, recurrent_state
-from cprl.system.compat import put_all
+from cprl.system.compat.tensordicts import put_all
 
-_WHOLE_NUMBERS: Final = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
-"""The dtypes of actions that convert to int64 without a change of any number."""
+_INTEGER_DTYPES: Final = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)
+"""The dtypes that actions may have: they convert to int64 without a change of any number."""
 
 
-def chosen(tensordict: TensorDictBase, name: str, size: torch.Size, device: torch.device) -> Tensor:
-    """Return ("agents", "action") or ("agents", "decision") as int64 [B, N] on a device.
+def read_choices(tensordict: TensorDictBase, name: str, size: torch.Size, device: torch.device) -> Tensor:
+    """Return the actions or decisions that a policy wrote, as int64 [B, N] on a device.
+
+    Args:
+        name: "action" or "decision", the entry under "agents".
+        size: the shape [B, N].
 
     Raises:
-        ValueError: if it is missing, or has another shape or dtype; other integers are converted.
+        ValueError: if the entry is missing, has another shape, or holds no integers.
     """
     try:
         entry: Tensor = keys.entry(keys.entry(tensordict, keys.AGENTS), name)
     except (KeyError, AttributeError):
         raise ValueError(f'("agents", "{name}") is missing; allowed: int64 {list(size)}') from None
-    if entry.dtype not in _WHOLE_NUMBERS or entry.shape != size:
+    if entry.dtype not in _INTEGER_DTYPES or entry.shape != size:
         raise ValueError(
             f'("agents", "{name}") is {entry.dtype} {list(entry.shape)}; allowed: int64 {list(size)}'
         )
@@ -33,17 +37,19 @@ def chosen(tensordict: TensorDictBase, name: str, size: torch.Size, device: torc
 
 
 def carry_on(
-    carried: TensorDictBase, turn: TensorDictBase, began: Tensor | None, replaced: frozenset[str]
+    next_input: TensorDictBase, turn: TensorDictBase, is_first: Tensor | None, env_entries: frozenset[str]
 ) -> None:
-    """Put into the input of the next turn what others than the environment wrote into this one.
+    """Copy the entries of a turn that policies and transforms wrote into the input of the next turn.
 
     Args:
-        replaced: the entries that the environment writes anew itself, at the root and under "agents".
-        began: the worlds whose episode begins, bool [B, 1], where recurrent states are zero; None for none.
+        is_first: bool [B, 1], True for worlds whose next turn is the first of an episode: there recurrent
+            states become zero. None where no episode begins.
+        env_entries: the entries that the environment itself writes in every turn, at the root and under
+            "agents"; they are not copied.
     """
-    put_all(carried, {name: value for name, value in turn.items() if name not in replaced})
-    of_agents = keys.entry(turn, keys.AGENTS).items()
-    others = {name: value for name, value in of_agents if name not in replaced}
-    put_all(keys.entry(carried, keys.AGENTS), others)
-    if began is not None and recurrent_state.AFTER in others:
-        recurrent_state.carry(carried, turn, began)
+    put_all(next_input, {name: value for name, value in turn.items() if name not in env_entries})
+    agents = keys.entry(turn, keys.AGENTS).items()
+    agent_entries = {name: value for name, value in agents if name not in env_entries}
+    put_all(keys.entry(next_input, keys.AGENTS), agent_entries)
+    if is_first is not None and recurrent_state.AFTER in agent_entries:
+        recurrent_state.carry(next_input, turn, is_first)

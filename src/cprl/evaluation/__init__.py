@@ -1,45 +1,41 @@
-"""Evaluation: the agents of stored runs in fresh worlds, with their own run or among others.
+"""Evaluation: agents of stored runs play in fresh worlds, without learning, with each other or with others.
 
 Modules, in the order in which one reads them:
-    lanes           stored and scripted agents of all replicas side by side, in fresh worlds; play, together:
-                    what they did, one tidy table; play_population
-    pages           what is printed and drawn of such a table, whatever its kind
-    evaluate        evaluate_run: all replicas of a run, beside the random policy
-    cross_play      crossplay: a focal agent of one run among background agents of another; gains
-    schelling       what restrained and greedy agents get, by how many of the others are restrained
-    scenarios       run_scenarios: a run among named backgrounds that it never met
-    fresh           fresh episodes that are shown, by default a typical one
-    film            an episode, every step recorded, or as a GIF or an MP4
-    film_pictures   the pictures of a film, and its files
+    populations     play_population: stored and scripted agents play; their episodes become a table
+    pages           the printed tables and the drawn matrices that several kinds of evaluation share
+    evaluate        evaluate_run: all replicas of a run, compared with the random policy
+    cross_play      crossplay: one focal agent of a run among background agents of another run
+    scenarios       run_scenarios: agents of a run among named backgrounds that they never met
+    fresh           one fresh episode of a run to be filmed or shown, by default a typical one
+    film            an episode as a recording for the viewer, or as a GIF or MP4
+    film_pictures   the pictures of a film, and the writing of its file
     show            episodes side by side on an HTML page
-    sandbox         an HTML page with sliders, whose agents play at once
-    export          episodes for other programs: CSV, Minari
-    play            a person among trained or scripted agents
+    play            an episode in which a person plays among trained or scripted agents
 """
 
 from cprl.evaluation.cross_play import by_focal_agent, crossplay, draw_gains, gains
 from cprl.evaluation.evaluate import evaluate_run
-from cprl.evaluation.lanes import play_population
-from cprl.evaluation.scenarios import Scenario, advantages, draw_scenarios, run_scenarios, scenarios_of
-from cprl.evaluation.schelling import dilemma, draw_schelling, margins, payoffs_of, schelling
+from cprl.evaluation.populations import play_population
+from cprl.evaluation.scenarios import (
+    Scenario,
+    draw_scenarios,
+    run_scenarios,
+    scenario_advantages,
+    scenarios_of,
+)
 from cprl.system.defaults import Fresh
 
 __all__ = [
     "Fresh",
     "Scenario",
-    "advantages",
     "by_focal_agent",
     "crossplay",
-    "dilemma",
     "draw_gains",
     "draw_scenarios",
-    "draw_schelling",
     "evaluate_run",
     "gains",
-    "margins",
-    "payoffs_of",
     "play_population",
     "run_scenarios",
+    "scenario_advantages",
     "scenarios_of",
-    "schelling",
 ]

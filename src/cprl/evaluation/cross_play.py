@@ -1,45 +1,56 @@
 """crossplay: a focal agent of one stored run plays with background agents of another.
 
-In cell (i, j) of the matrix the focal agent, with index s, is from run i, and all others, the background
-agents, are from run j. Each cell is played for every index s and every replica r of both runs, in the same
-worlds. A number of a cell is the mean over focal agents, estimated over replicas.
+The results form a matrix. In cell (i, j) one agent, the focal agent, is from run i, and all others, the
+background agents, are from run j. Every index of the population is that of the focal agent in turn, every
+replica plays, and all cells are played in the same worlds. The value of a cell is a mean over focal agents,
+estimated over replicas.
 
-The diagonal is self-play: the focal agent was trained with the background agents, in the same replica. In all
-other cells it is from another run and was not trained with them. diagonal="cross_seed" separates the two
-effects: the focal agent of the diagonal is then from the run's next replica, trained in the same way but not
-with the background agents.
+The diagonal is self-play: there the focal agent was trained together with the background agents. In all other
+cells it is from another run, and was not trained with them: two differences at once. With
+diagonal="cross_seed" the focal agent of the diagonal is from the run's next replica, trained in the same way
+but not together with the background agents, so that only the first difference remains.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import pyarrow as pa
 
-from cprl.evaluation.evaluate import opened, refuse_other_games
-from cprl.evaluation.lanes import agents_of, fresh_for, play, roles_of, said, together
-from cprl.evaluation.pages import draw_matrices, heading, matrix_cells, row_cells
-from cprl.measuring.registry import COLLECTIVE_RETURN, FINES, INCOME, with_unit
-from cprl.measuring.statistics import HOLM, Family, differences, estimates
-from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, Label, labelled, numbers_in, where
+from cprl.evaluation.evaluate import as_loaded, refuse_other_games
+from cprl.evaluation.pages import draw_matrices, heading, matrix_table, row_table
+from cprl.evaluation.populations import (
+    AgentOfReplica,
+    agents_of,
+    fresh_for,
+    join_tables,
+    play_fresh,
+    roles_of,
+    table_note,
+)
+from cprl.measuring.registry import COLLECTIVE_RETURN, FINES_TOTAL, INCOME, with_unit
+from cprl.measuring.statistics import HOLM_NOTE, Family, differences, estimates
+from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, Label, all_metrics, labelled, where
 from cprl.system.defaults import Diagonal, Fresh
 from cprl.system.working import working
 from cprl.terminal import style
-from cprl.terminal.summary import rewards_of, says_nothing
-from cprl.terminal.tables import Cells
+from cprl.terminal.summary import is_empty_row, rewards_of
+from cprl.terminal.text_tables import TextTable
 from cprl.training.stored import LoadedRun
 from cprl.values import checked, refusal
 
-SELF_PLAY: Final = -1
-"""The focal agent of self-play in tables: every agent is focal and background."""
+_SELF_PLAY: Final = -1
+"""The value of "focal_agent" in rows of self-play, in which every agent is both focal and background."""
 PAIR: Final = (FOCAL, BACKGROUND)
 """The labels of a cell: the names of the focal agent's run and of the background agents' run."""
-OF_FOCAL: Final = "focal/return"
-OF_BACKGROUND: Final = "background/return"
-RETURNS: Final = (OF_FOCAL, OF_BACKGROUND, INCOME)
+FOCAL_RETURN: Final = "focal/return"
+BACKGROUND_RETURN: Final = "background/return"
+CROSS_PLAY_RETURNS: Final = (FOCAL_RETURN, BACKGROUND_RETURN, INCOME)
+"""The returns of a cross-play: per focal agent, per background agent, and of all agents together."""
 
 Runs = Sequence[str | Path | LoadedRun] | Mapping[str, str | Path | LoadedRun]
+"""Runs as directories or loaded, in a list, or in a mapping from the names that they get in tables."""
 
 
 @working("playing each other")
@@ -47,137 +58,175 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
     """Let agents of each run play with agents of each other run, one focal agent at a time.
 
     Args:
-        runs: at least two runs of the same game: directories, exported results, or values of `cprl.load`;
-            or a table of them by the names that they get, which are otherwise those of their directories.
-        fresh: which episodes, with each focal agent.
-        diagonal: the pairing of a run with itself: "self", agents that were trained together, or
-            "cross_seed", a focal agent of the run's next replica.
+        runs: at least two runs of the same game: directories, exported results, or values of `cprl.load`.
+            A mapping gives them names; by default they are named after their directories.
+        fresh: the number of episodes with each focal agent, their seed, and the replicas that play.
+        diagonal: how a run is paired with itself: "self", all agents of one replica; or "cross_seed", a focal
+            agent of the run's next replica.
 
     Returns:
-        A row for each cell, focal agent, replica, episode and agent, see `cprl.measuring.table`, by "focal"
-        and "background", the names of runs, and "focal_agent", -1 in self-play. The replica is that of the
-        background agents.
+        A table with a row for each cell, focal agent, replica, episode and agent, see
+        `cprl.measuring.table`. The columns "focal" and "background" have the names of the runs, "focal_agent"
+        the index of the focal agent, -1 in self-play. "replica" is that of the background agents.
     """
     checked("diagonal", diagonal, Diagonal)
-    named = named_runs(runs)
-    fresh = fresh_for(named.values(), fresh)
-    numbers = fresh.replicas
-    if diagonal == "cross_seed" and len(numbers) < 2:
-        raise ValueError(f"the replicas are {list(numbers)}; allowed for cross_seed: at least 2")
-    following = dict(zip(numbers, (*numbers[1:], numbers[0]), strict=True))
+    loaded = named_runs(runs)
+    fresh = fresh_for(loaded.values(), fresh)
+    replicas = fresh.replicas
+    if diagonal == "cross_seed" and len(replicas) < 2:
+        raise ValueError(f"the replicas are {list(replicas)}; allowed for cross_seed: at least 2")
+    next_replica = dict(zip(replicas, (*replicas[1:], replicas[0]), strict=True))
 
-    def cell(focal: str, background: str) -> Iterator[pa.Table]:
-        home = agents_of(named[background])
-        populations = {SELF_PLAY: (home, [BOTH] * len(home))}
-        if focal != background or diagonal != "self":
-            visitors = agents_of(named[focal], following if focal == background else None)
-            populations = {
-                agent: ([*home[:agent], visitor, *home[agent + 1 :]], roles_of(len(home), [agent]))
-                for agent, visitor in enumerate(visitors)
-            }
-        for agent, (agents, roles) in populations.items():
-            labels: Label = {FOCAL: focal, BACKGROUND: background, "focal_agent": agent}
-            yield play(fresh, named[background], agents, labels, roles=roles, among=named.values())
+    def populations(focal: str, background: str) -> Iterator[_Population]:
+        """Yield the populations of a cell, one for each focal agent; in self-play there is a single one."""
+        background_agents = agents_of(loaded[background])
+        count = len(background_agents)
+        if focal == background and diagonal == "self":
+            yield _Population(_SELF_PLAY, background_agents, [BOTH] * count)
+            return
+        stored_replicas = next_replica if focal == background else None
+        focal_agents = agents_of(loaded[focal], stored_replicas)
+        for index, focal_agent in enumerate(focal_agents):
+            agents = [*background_agents[:index], focal_agent, *background_agents[index + 1 :]]
+            yield _Population(index, agents, roles_of(count, [index]))
 
-    each = " with focal agent at each index"
-    return together(
-        (part for pair in product(named, repeat=2) for part in cell(*pair)),
-        heading=heading("Cross-play", fresh, named.values(), each, f", diagonal: {diagonal}"),
+    def cell_tables() -> Iterator[pa.Table]:
+        for focal, background in product(loaded, repeat=2):
+            for population in populations(focal, background):
+                labels: Label = {FOCAL: focal, BACKGROUND: background, "focal_agent": population.focal_agent}
+                yield play_fresh(
+                    fresh,
+                    loaded[background],
+                    population.agents,
+                    labels,
+                    roles=population.roles,
+                    among=loaded.values(),
+                )
+
+    per_focal_agent = " with focal agent at each index"
+    return join_tables(
+        cell_tables(),
+        heading=heading("Cross-play", fresh, loaded.values(), per_focal_agent, f", diagonal: {diagonal}"),
         fresh=fresh,
         diagonal=diagonal,
     )
 
 
+class _Population(NamedTuple):
+    """The agents that play together in a cell of the matrix."""
+
+    focal_agent: int
+    """The index of the focal agent; `_SELF_PLAY` if there is no single one."""
+    agents: list[AgentOfReplica]
+    roles: list[str]
+    """The role of each agent, see `cprl.measuring.table.ROLE`."""
+
+
 def named_runs(runs: Runs) -> dict[str, LoadedRun]:
-    """Return runs of the same game of several agents by given names, by names of their directories, or by
-    their paths if those coincide."""
-    loaded = [opened(run) for run in (runs.values() if isinstance(runs, Mapping) else runs)]
+    """Load runs, and return them by name; refuse runs of different games, or of a game with one agent.
+
+    A run's name is the one it is given, or else that of its directory, or its whole path if two directories
+    have the same name.
+    """
+    values = runs.values() if isinstance(runs, Mapping) else runs
+    loaded = [as_loaded(run) for run in values]
     if len(loaded) < 2:
         raise refusal("the number of runs", len(loaded), "at least two")
     paths = [run.path.resolve() for run in loaded]
-    twice = [path for path in paths if paths.count(path) > 1]
-    if twice:
-        raise ValueError(f"{twice[0]} is given twice; allowed: different runs")
+    repeated = [path for path in paths if paths.count(path) > 1]
+    if repeated:
+        raise ValueError(f"{repeated[0]} is given twice; allowed: different runs")
     names = list(runs) if isinstance(runs, Mapping) else [path.name for path in paths]
     if len(set(names)) < len(names):
         names = list(map(str, paths))
-    named = dict(zip(names, loaded, strict=True))
-    refuse_other_games(named)
+    by_name = dict(zip(names, loaded, strict=True))
+    refuse_other_games(by_name)
     if loaded[0].game.agents == 1:
         raise ValueError("the game has 1 agent; allowed: at least 2; use `cprl evaluate`")
-    return named
+    return by_name
 
 
 def gains(table: pa.Table) -> Family:
-    """Return what focal and background agents of a cross-play get more than the same background agents among
-    themselves, by "focal" and "background".
+    """Return how much more agents get in each cell of a cross-play than on the diagonal.
 
-    "focal/return" is compared with the agent whose place the focal agent takes, "background/return" with the
-    same agents of the diagonal. Replicas are paired, because both cells have the same background agents and
-    worlds. With diagonal="cross_seed" the agent whose place is taken was not trained with the background
-    agents either, so that a gain is due to the run alone.
+    Each cell is compared with the diagonal's cell of the same background agents: "focal/return" with the
+    return of the agent whose place the focal agent takes, "background/return" with that of the same
+    background agents. Differences are paired by replica, because both cells have the same background agents
+    and worlds. With diagonal="cross_seed" the replaced agent was not trained with the background agents
+    either, so that a gain comes from the focal agent's run alone.
+
+    Returns:
+        The differences, by "focal" and "background".
     """
 
-    def at_home(cell: Mapping[str, str]) -> dict[str, str]:
+    def diagonal(cell: Mapping[str, str]) -> dict[str, str]:
         return {FOCAL: cell[BACKGROUND]}
 
-    return differences(table, [OF_FOCAL, OF_BACKGROUND], PAIR, at_home)
+    return differences(table, [FOCAL_RETURN, BACKGROUND_RETURN], PAIR, diagonal)
 
 
 def by_focal_agent(table: pa.Table) -> pa.Table:
-    """Return the table of a cross-play in which each agent of self-play is the focal one in turn."""
+    """Return the table of a cross-play with the rows of self-play once for each agent as the focal agent."""
     agents = len(table["agent"].unique())
-    parts = []
+    tables = []
     for agent in range(agents):
-        part = where(table, focal_agent=(agent, SELF_PLAY)).drop_columns(["focal_agent", ROLE])
-        roles = pa.array(roles_of(agents, [agent])).take(part["agent"])
-        parts.append(labelled(part, focal_agent=agent).append_column(ROLE, roles))
-    return pa.concat_tables(parts).select(table.column_names)
+        rows = where(table, focal_agent=(agent, _SELF_PLAY)).drop_columns(["focal_agent", ROLE])
+        roles = pa.array(roles_of(agents, [agent])).take(rows["agent"])
+        tables.append(labelled(rows, focal_agent=agent).append_column(ROLE, roles))
+    return pa.concat_tables(tables).select(table.column_names)
 
 
-_BESIDE: Final = {
-    OF_FOCAL: "the focal agent, beside the agent whose place it takes",
-    OF_BACKGROUND: "the background agents, beside themselves without it",
+_GAINS: Final = {
+    FOCAL_RETURN: "the focal agent, beside the agent whose place it takes",
+    BACKGROUND_RETURN: "the background agents, beside themselves without it",
 }
+"""The returns of which `gains` are drawn, each with the words for its two sides."""
 
 
 def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page") -> Path:
-    """Draw `gains`, a row for each focal agent's run, a column for each of background agents; on the diagonal
-    an agent's return. A star where one is not 0 by Holm's method for all that are drawn."""
+    """Draw the `gains` as two matrices, with an agent's return on the diagonal.
+
+    The focal agent's run has rows, and that of the background agents columns. A star marks gains that differ
+    from 0 by Holm's method for all drawn gains.
+    """
     gained = gains(table)
-    at_home = {key[:-1]: one for key, one in estimates(table, OF_FOCAL, PAIR).items() if key[0] == key[1]}
+    returns = estimates(table, FOCAL_RETURN, PAIR)
+    texts = {
+        pair: f"{returns[(*pair, FOCAL_RETURN)].value:.3g}" for pair in returns.labels if pair[0] == pair[1]
+    }
     unit = f", {rewards_of(table)}".removesuffix(", ")
-    diagonal = said(table, "diagonal").replace("_", "-")
+    diagonal = table_note(table, "diagonal").replace("_", "-")
     return draw_matrices(
         path,
         gained,
-        _BESIDE,
+        _GAINS,
         title="Cross-play: who gains among whom",
         caption=(
-            f"Difference in return{unit}; {said(table, 'fresh')} with focal agent at each index; diagonal "
-            f"({diagonal}): an agent's return. {HOLM} for these {len(gained)}."
+            f"Difference in return{unit}; {table_note(table, 'fresh')} with focal agent at each index; "
+            f"diagonal ({diagonal}): an agent's return. {HOLM_NOTE} for these {len(gained)}."
         ),
-        more={pair: f"{one.value:.3g}" for pair, one in at_home.items()},
+        other_cells=texts,
         width=width,
     )
 
 
-def crossplay_cells(table: pa.Table) -> Iterator[Cells]:
-    """Yield a matrix of what focal agents gain, one of what background agents do, and one for each number,
-    rows the focal agent's run, columns the background agents' run; and all returns by the focal agent's
-    index."""
+def crossplay_tables(table: pa.Table) -> Iterator[TextTable]:
+    """Yield matrices of the gains and of all metrics, and a table of the returns by the focal agent's index.
+
+    In a matrix the focal agent's run has rows, and that of the background agents columns.
+    """
     rewards = rewards_of(table)
     gained = gains(table)
-    for number, beside in _BESIDE.items():
-        name = with_unit(number, rewards=rewards)
-        title = f"{name}, difference of {beside}, paired by replica [95 % interval by Student's t]"
-        yield matrix_cells(gained, number, title, gained.note("of both tables"))
-    numbers = dict.fromkeys([*RETURNS, *numbers_in(table)])
-    if FINES not in table.column_names:  # a reward is an apple then
-        numbers.pop(COLLECTIVE_RETURN, None)
-    levels = estimates(table, list(numbers), PAIR)
-    for number in numbers:
-        if not says_nothing(number, levels):
-            yield matrix_cells(levels, number, with_unit(number, rewards=rewards))
-    by_agent = estimates(by_focal_agent(table), RETURNS, (*PAIR, "focal_agent"))
-    yield row_cells(by_agent, "returns by the focal agent's index", rewards=rewards)
+    for metric, sides in _GAINS.items():
+        name = with_unit(metric, rewards=rewards)
+        title = f"{name}, difference of {sides}, paired by replica [95 % interval by Student's t]"
+        yield matrix_table(gained, metric, title, gained.note("of both tables"))
+    metrics = dict.fromkeys([*CROSS_PLAY_RETURNS, *all_metrics(table)])
+    if FINES_TOTAL not in table.column_names:  # without fines the collective return equals the income
+        metrics.pop(COLLECTIVE_RETURN, None)
+    levels = estimates(table, list(metrics), PAIR)
+    for metric in metrics:
+        if not is_empty_row(metric, levels):
+            yield matrix_table(levels, metric, with_unit(metric, rewards=rewards))
+    by_agent = estimates(by_focal_agent(table), CROSS_PLAY_RETURNS, (*PAIR, "focal_agent"))
+    yield row_table(by_agent, "returns by the focal agent's index", rewards=rewards)

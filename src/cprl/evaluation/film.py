@@ -1,4 +1,4 @@
-"""Film an episode of the agents of stored runs: as a recording, or side by side as a GIF or an MP4."""
+"""Films an episode of stored agents: as a recording for the viewer, or as a GIF or MP4 of several runs."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -23,21 +23,28 @@ from cprl.evaluation.film_pictures import (
     write_gif,
     write_mp4,
 )
-from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episode, fresh_episodes, record, say_which
-from cprl.evaluation.lanes import commons_game
-from cprl.measuring.episodes import Episode, tracker_of
-from cprl.measuring.evaluate import turns
+from cprl.evaluation.fresh import (
+    FreshEpisode,
+    Recorded,
+    fresh_episode,
+    fresh_episodes,
+    print_descriptions,
+    record,
+)
+from cprl.evaluation.populations import commons_game
+from cprl.measuring.playing import turns
 from cprl.measuring.series import Observer
+from cprl.measuring.tracker import Episode, tracker_of
 from cprl.pictures.readable import growth_of, in_lower_case, legend_of
 from cprl.runs.files import refuse_to_write_over
-from cprl.system.defaults import FILM_SUFFIXES as SUFFIXES
+from cprl.system.defaults import FILM_SUFFIXES
 from cprl.system.output import legible
 from cprl.system.working import working
 from cprl.training.stored import LoadedRun
 from cprl.values import Positive, Range, Value, Where, checked, refusal
-from cprl.values.arrays import Bool, UInt8
+from cprl.values.array_types import Bool, UInt8
 from cprl.viewer.callback import ViewerCallback
-from cprl.viewer.replay import Decisions, Offences, events
+from cprl.viewer.replay_views import Decisions, ViolationMarks, events
 
 
 @working("making a film")
@@ -49,18 +56,21 @@ def film(
     episode: int | None = None,
     seed: int | None = None,
 ) -> tuple[Path, Episode]:
-    """Record an episode of a run's agents in a fresh world, with the exploration of evaluation; say which.
+    """Record an episode of a run's agents in a fresh world, with the exploration of evaluations.
+
+    Print which episode it is.
 
     Args:
-        out: the recording, a .rrd, complete or absent; by default `film-<replica>-<episode>.rrd` in the run's
-            directory.
-        replica, episode: which fresh episode; by default a typical one, see `cprl.evaluation.fresh`. Equal
-            numbers give equal episodes.
-        seed: of the worlds and all chance. The world is that of `evaluate_run` with the same seed, of number
-            replica x episodes + episode there; what agents draw is their own.
+        run: the run's directory.
+        out: the recording, a .rrd file; by default `film-<replica>-<episode>.rrd` in the run's directory. It
+            is written completely or not at all.
+        replica: the number of the replica; by default a typical one, see `cprl.evaluation.fresh`.
+        episode: the number of the episode; by default a typical one.
+        seed: the seed of the worlds and of all random choices. In `evaluate_run` with the same seed the
+            episode's world has the number replica * episodes + episode, but the agents' choices differ.
 
     Returns:
-        The recording, and the episode.
+        The path of the recording, and the episode.
 
     Raises:
         FileExistsError: if the recording exists.
@@ -70,21 +80,22 @@ def film(
     if out is not None:
         refuse_to_write_over(Path(out))
     fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed)
-    which = f"{fresh.replica}-{fresh.episode}"
-    target = Path(run) / f"film-{which}.rrd" if out is None else Path(out)
+    numbers = f"{fresh.replica}-{fresh.episode}"
+    target = Path(run) / f"film-{numbers}.rrd" if out is None else Path(out)
     refuse_to_write_over(target)
-    say_which([fresh])
+    print_descriptions([fresh])
     target.parent.mkdir(parents=True, exist_ok=True)
     title = f"{legible(Path(run).name)}, agents of replica {fresh.replica}, fresh episode {fresh.episode}"
     try:
-        return target, _recorded(fresh, target, title)
-    except BaseException:  # a recording of half an episode would stand in the way of the next attempt
+        return target, _record_to_file(fresh, target, title)
+    except BaseException:  # the next attempt would refuse to overwrite the recording of half an episode
         target.unlink(missing_ok=True)
         raise
 
 
 @working("playing an episode")
-def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
+def _record_to_file(fresh: FreshEpisode, target: Path, title: str) -> Episode:
+    """Play an episode and record all its turns."""
     env = fresh.env
     commons = commons_of(env)
     with ViewerCallback(
@@ -102,7 +113,7 @@ def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
         if scene is not None:
             views.append(Decisions(logger, scene, fresh.policies, actions=fresh.run.game.actions))
             if commons is not None and scene.has_institutions:
-                views.append(Offences(logger, commons))
+                views.append(ViolationMarks(logger, commons))
         observer = Observer(views, env)
         tracker = tracker_of(env)
         for step, batch in enumerate(turns(env, fresh.policies), start=1):
@@ -116,46 +127,45 @@ def _recorded(fresh: FreshEpisode, target: Path, title: str) -> Episode:
 
 
 def _tags_in(batch: TensorDictBase) -> list[str]:
-    """Return who was tagged out by whom in a turn, a sentence for each."""
+    """Return a sentence for each agent that was tagged out in a turn."""
     tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
     pairs = [] if tagged_by is None else tagged_by[0].nonzero().tolist()
-    return [f"agent {tagged} is tagged out by agent {by}" for tagged, by in pairs]
+    return [f"agent {tagged} is tagged out by agent {shooter}" for tagged, shooter in pairs]
 
 
 def _log(viewer: ViewerCallback, step: int, event: str) -> None:
     """Log an event of the episode."""
-    viewer.logger.at(step=step, episode=0)
+    viewer.logger.set_time(step=step, episode=0)
     viewer.logger.log_text(f"step {step:,}: {event}")
 
 
 DEFAULT_FPS: Final = 15.0
 MOST_FPS: Final = 50.0
-"""Browsers slow a GIF down that is faster."""
-GIF_FRAMES: Final = 300
-"""The pictures of a GIF, at most, unless `every` is given."""
-_SAMPLES: Final = 24
-"""The pictures from which a GIF's palette is taken."""
+"""The largest number of pictures per second: browsers slow down GIFs that are faster."""
+_GIF_FRAMES: Final = 300
+"""The largest number of pictures in a GIF, unless `Style.every` is given."""
+_PALETTE_SAMPLES: Final = 24
+"""The number of pictures from which a GIF's palette is taken."""
 Fps = Annotated[float, Where(lambda fps: 0 < fps <= MOST_FPS, f"a number above 0, at most {MOST_FPS:g}")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Style(Value, stored=False):
-    """How a film shows an episode."""
+    """The look of a film: its titles, speed and size."""
 
     titles: tuple[str, ...] = ()
-    """Of the run and those beside it, one each; by default the institutions of each, or the names of their
-    experiments."""
+    """The title of each run; by default the institutions of the runs, or the names of their experiments."""
     every: Positive | None = None
-    """Turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many as it takes for
-    300 pictures."""
+    """The number of turns between two pictures; by default 1 for an .mp4, and for a .gif as many as give 300
+    pictures."""
     fps: Fps = DEFAULT_FPS
-    """Pictures per second; in a .gif rounded to hundredths of a second a picture."""
+    """The pictures per second. In a .gif a picture lasts a whole number of hundredths of a second."""
     width: Positive | None = None
-    """Of the pictures in pixels, at most 1920, and at least 240 for each run; by default 640 for each run
-    that has room. The height follows from the boards, each at most twice as high as its part is wide."""
+    """The width of the film in pixels, at most 1920 and at least 240 for each run; by default 640 for each
+    run, if that fits. The height follows from the boards, which are at most twice as high as wide."""
 
     def width_of_each(self, runs: int) -> int:
-        """Return the width of the part of each run."""
+        """Return the width of the panel of each run, in pixels."""
         width = min(LARGEST_WIDTH, DEFAULT_WIDTH * runs) if self.width is None else self.width
         allowed = Annotated[int, Range(SMALLEST_WIDTH * runs, LARGEST_WIDTH)]
         return int(checked("width", width, allowed)) // runs
@@ -172,31 +182,36 @@ def film_video(
     seed: int | None = None,
     style: Style = Style(),
 ) -> tuple[Path, tuple[Episode, ...]]:
-    """Film an episode of a run's agents, beside the agents of other runs if there are any.
+    """Film an episode of a run's agents as a GIF or MP4, beside the agents of other runs if any are given.
 
-    A film shows the board, the apples on it and what each agent picked so far, turn by turn. From the first
-    picture a line says what the episode comes to, and a card of two seconds at the end says it again; a note
-    below says what the signs mean. Agents that broke a rule since the last picture have a white diamond
-    around them. Populations side by side play on one clock; one whose board is dead waits for the others.
+    A film shows the board, its apples, and the harvest of each agent so far, turn by turn. A line above the
+    board says from the first picture on how the episode ends, and a card at the end says it again for two
+    seconds; a note below explains the signs. Agents that broke a rule since the last picture have a white
+    diamond around them. All panels show the same turn; a panel whose episode is over waits for the others.
 
-    It is the episode that `cprl.evaluation.film.film` records with the same numbers; the first and the last
-    board are always in the film.
+    The episode is the one that `cprl.evaluation.film.film` records with the same numbers. The first and the
+    last board are always in the film.
 
     Args:
-        out: the film, a .gif or, with imageio-ffmpeg, an .mp4; complete or absent.
-        beside: more runs, whose agents are shown to the right of the first. Games may differ; where they do
-            not, all play the same fresh world.
+        run: the run's directory.
+        out: the film, a .gif or, with imageio-ffmpeg, an .mp4. It is written completely or not at all.
+        beside: further runs, which are shown to the right of the first. Runs of the same game play in the
+            same fresh world.
+        replica: the number of the replica; by default a typical one, see `cprl.evaluation.fresh`.
+        episode: the number of the episode; by default a typical one.
+        seed: the seed of the worlds and of all random choices.
+        style: the titles, the speed and the size of the film.
 
     Returns:
-        The film, and the episode of each run.
+        The path of the film, and the episode of each run.
 
     Raises:
         FileExistsError: if the film exists.
         ModuleNotFoundError: for an .mp4 without imageio-ffmpeg.
     """
     path = Path(out)
-    if path.suffix not in SUFFIXES:
-        raise refusal("out", str(path), f"a file whose name ends in {' or '.join(SUFFIXES)}")
+    if path.suffix not in FILM_SUFFIXES:
+        raise refusal("out", str(path), f"a file whose name ends in {' or '.join(FILM_SUFFIXES)}")
     runs = (run, *beside)
     most_runs = LARGEST_WIDTH // SMALLEST_WIDTH
     if len(runs) > most_runs:
@@ -207,42 +222,45 @@ def film_video(
     if path.suffix == ".mp4":
         check_can_write_mp4(path)
     fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
-    say_which(fresh)
+    print_descriptions(fresh)
     panels = _panels(fresh, style.titles or titles_of(fresh), width)
     length = max(len(panel.played.boards) for panel in panels)
-    every = style.every or (1 if path.suffix == ".mp4" else ceil(length / GIF_FRAMES))
-    chosen = sorted({*range(0, length, every), length - 1})
+    every = style.every or (1 if path.suffix == ".mp4" else ceil(length / _GIF_FRAMES))
+    filmed_turns = sorted({*range(0, length, every), length - 1})
 
     def draw(turns: Sequence[int]) -> Iterator[UInt8]:
         """Yield the pictures after these turns, and the end card."""
-        for before, turn in pairwise((-1, *turns)):
-            yield joined([panel.draw(turn, since=before + 1) for panel in panels])
-        yield joined([panel.draw(length, since=length, card=True) for panel in panels])
+        for previous, turn in pairwise((-1, *turns)):
+            yield join_panels([panel.draw(turn, since=previous + 1) for panel in panels])
+        yield join_panels([panel.draw(length, since=length, card=True) for panel in panels])
 
-    def joined(pictures: Sequence[UInt8]) -> UInt8:
-        return np.concatenate([np.concatenate(pictures, 1), words], 0)
+    def join_panels(pictures: Sequence[UInt8]) -> UInt8:
+        return np.concatenate([np.concatenate(pictures, 1), legend], 0)
 
     games = [commons_game(population.run) for population in fresh]
-    wide = sum(panel.picture.size[0] for panel in panels)
-    words = note(f"{growth_of(games[0])} {legend_of(games)}", wide)
+    film_width = sum(panel.picture.size[0] for panel in panels)
+    legend = note(f"{growth_of(games[0])} {legend_of(games)}", film_width)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.suffix == ".mp4":
-        write_mp4(path, draw(chosen), fps=style.fps)
+        write_mp4(path, draw(filmed_turns), fps=style.fps)
     else:
-        samples = list(draw(chosen[:: ceil(len(chosen) / _SAMPLES)]))
-        write_gif(path, draw(chosen), samples, fps=style.fps)
+        samples = list(draw(filmed_turns[:: ceil(len(filmed_turns) / _PALETTE_SAMPLES)]))
+        write_gif(path, draw(filmed_turns), samples, fps=style.fps)
     return path, tuple(panel.played.episode for panel in panels)
 
 
 def check_titles(titles: Sequence[str], runs: int) -> None:
-    """Refuse titles that are not one printable line for each run; none are fine."""
+    """Refuse titles unless they are one printable line for each run; no titles are allowed too."""
     if titles and (len(titles) != runs or not all(map(str.isprintable, titles))):
         raise refusal("titles", titles, f"a line of text for each of {runs} runs")
 
 
 def titles_of(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
-    """Return what tells runs apart: their institutions and transforms, their names, or the names of their
-    directories."""
+    """Return titles that distinguish the runs.
+
+    They are the runs' institutions and transforms; if some of these are equal, the names of the experiments;
+    and if some of these are equal too, the names of the directories.
+    """
     rules = [in_lower_case(" and ".join(_rules_in(population.run))) for population in fresh]
     names = [population.run.experiment.name.replace("_", " ") for population in fresh]
     titles = [rule or "no rule" for rule in rules] if any(rules) else names
@@ -260,46 +278,50 @@ def _rules_in(run: LoadedRun) -> list[str]:
 
 
 class _Panel(NamedTuple):
-    """What a film shows of one population."""
+    """The part of a film that shows the agents of one run."""
 
     title: str
     picture: EpisodePicture
     played: Recorded
     violated: Bool
-    """[T + 1, N], which agents broke a rule in the turn that led to each board."""
+    """bool [T + 1, N], the agents that broke a rule in the turn before each board."""
     is_typical: bool
+    """Whether the episode was chosen as a typical one."""
 
     def draw(self, turn: int, *, since: int, card: bool = False) -> UInt8:
-        """Draw the population after a turn of the film's clock, or at its end if that was before.
+        """Return the picture after a turn, or after the last turn if the episode is over.
 
         Args:
-            card: whether to say how the episode ended.
+            since: the first turn whose violations are marked.
+            card: whether to draw the card that says how the episode ended.
         """
         played = self.played
-        dead = ""
+        death = ""
         if played.is_dead:
-            dead = f"gone for good at turn {played.last:,} of {self.picture.steps:,}"
-        outcome = dead or f"{played.left:,} of {len(self.picture.board.sites):,} still on the board"
+            death = f"gone for good at turn {played.last:,} of {self.picture.steps:,}"
+        outcome = death or f"{played.left:,} of {len(self.picture.board.sites):,} still on the board"
         count = int(played.boards[-1].harvested.sum())
         apples = f"{count:,} apple{'s' * (count != 1)} picked"
-        which = "A typical episode" if self.is_typical else "This episode"
+        subject = "A typical episode" if self.is_typical else "This episode"
+        end = death if turn >= played.last else ""
+        card_text = f"{apples} · {outcome}" if card else ""
         return self.picture.draw(
             played.boards[: turn + 1],
             self.title,
-            comes_to=f"{which}: {apples}, {outcome}",
-            end=dead if turn >= played.last else "",
-            card=f"{apples} · {outcome}" if card else "",
+            comes_to=f"{subject}: {apples}, {outcome}",
+            end=end,
+            card=card_text,
             violators=np.flatnonzero(self.violated[since : turn + 1].any(0)).tolist(),
         )
 
 
 def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) -> list[_Panel]:
-    """Play the episodes; return what is shown of each, in panels of one size with one axis of harvests."""
+    """Play the episodes and return their panels, all of the same size and with the same axis of harvests."""
     games = [commons_game(population.run) for population in fresh]
     episodes = [record(population) for population in fresh]
-    most = max(int(played.boards[-1].harvested.max()) for played in episodes)
+    most_harvested = max(int(played.boards[-1].harvested.max()) for played in episodes)
     height = max(EpisodePicture(game.map, steps=1, width=width).size[1] for game in games)
-    sizes = {"width": width, "height": height, "most_harvested": most}
+    sizes = {"width": width, "height": height, "most_harvested": most_harvested}
     panels = []
     for title, population, game, played in zip(titles, fresh, games, episodes, strict=True):
         picture = EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes)

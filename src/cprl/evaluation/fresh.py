@@ -1,7 +1,7 @@
-"""Fresh episodes of stored agents, which are filmed, shown and exported; and which of them is typical.
+"""Chooses and plays one fresh episode of stored agents, to be filmed, shown or exported.
 
-The trained agents of a run may do well in one replica and badly in another: what is shown without a choice is
-an episode near the middle, and words say so, and what the others do.
+The trained agents of a run may do well in one replica and badly in another. By default the episode is
+therefore a typical one, near the medians of the replicas, and its description says how the replicas differ.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,71 +15,74 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons.game import Game
-from cprl.commons.world import Shown
+from cprl.commons.world import WorldView
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import commons_of
-from cprl.evaluation.evaluate import opened
-from cprl.evaluation.lanes import refuse_trained_in
+from cprl.evaluation.evaluate import as_loaded
+from cprl.evaluation.populations import refuse_trained_in
 from cprl.experiment import Experiment
-from cprl.measuring.episodes import Episode, tracker_of
-from cprl.measuring.evaluate import evaluate, turns
+from cprl.measuring.playing import evaluate, turns
 from cprl.measuring.registry import COLLECTIVE_RETURN
 from cprl.measuring.table import where
-from cprl.policies.assignment import AgentPolicies
+from cprl.measuring.tracker import Episode, tracker_of
+from cprl.policies.joint_policy import JointPolicy
 from cprl.population import AgentSpec
 from cprl.runs.episodes import read_rows
-from cprl.system.defaults import FILM_SEED as SEED
+from cprl.system.defaults import FILM_SEED
 from cprl.system.output import say
 from cprl.system.working import working
 from cprl.training.stored import LoadedRun
 from cprl.values import Natural, Range, Seed, checked
 
 EPISODES_TRIED: Final = 5
-"""The fresh episodes among which a typical one is looked for."""
+"""The number of fresh episodes from which a typical one is chosen."""
 _MOST_LISTED: Final = 6
-"""Replicas whose averages a sentence lists one by one."""
+"""The largest number of replicas whose averages a sentence lists one by one."""
 
 
 class FreshEpisode(NamedTuple):
-    """A fresh world of a run's game, and who plays in it."""
+    """An episode that can be played: a fresh world of a run's game, and the policies of its agents."""
 
     run: LoadedRun
     env: EnvBase
     """One world, with the run's transforms."""
-    policies: AgentPolicies
+    policies: JointPolicy
     replica: int
     episode: int
     is_typical: bool = False
-    """Whether it was chosen as the one whose turns and apples are nearest to their medians over replicas."""
+    """Whether it was chosen because its turns and apples are nearest to their medians over replicas."""
 
     @property
-    def words(self) -> str:
-        """Which episode it is, and what the trained agents of the run come to on average."""
-        known = averages_in_words(self.run)
+    def description(self) -> str:
+        """Return sentences that name the episode and say the averages of the run's trained agents."""
+        averages_sentence = averages_in_words(self.run)
         if not self.is_typical:
-            return f"Replica {self.replica}, episode {self.episode}. {known}".rstrip()
+            return f"Replica {self.replica}, episode {self.episode}. {averages_sentence}".rstrip()
         averages = averages_of(self.run)
         turns, apples = _median(averages)
         middle = "the medians of the replicas" if len(averages) > 1 else "the averages"
         near = f"{middle}, {turns:,.0f} turns and {apples:,.0f} apples"
-        chosen = f"chosen of the first {EPISODES_TRIED} for a life and a harvest near {near}"
-        which = f"replica {self.replica}, episode {self.episode}"
-        return f"A typical episode ({which}), {chosen}. {known}"
+        reason = f"chosen of the first {EPISODES_TRIED} for a life and a harvest near {near}"
+        numbers = f"replica {self.replica}, episode {self.episode}"
+        return f"A typical episode ({numbers}), {reason}. {averages_sentence}"
 
 
 def averages_of(run: LoadedRun) -> dict[int, tuple[float, float]]:
-    """Return how many turns the trained agents of each replica last and how many apples they pick, on average
-    over the run's own evaluation, by replica; {} of a run that has none, or in which nobody learned."""
+    """Return the average turns and apples in the evaluation of a run's trained agents, by replica.
+
+    Return {} for a run without an evaluation, or in which nobody learned.
+    """
     path = run.path / "evaluation" / "trained.parquet"
-    names = ("survival_steps", COLLECTIVE_RETURN)
+    metrics = ("survival_steps", COLLECTIVE_RETURN)
     if not run.networks or not path.is_file():
         return {}
     table = read_rows(path)
-    if not {*names} <= {*table.column_names}:
+    if not set(metrics) <= set(table.column_names):
         return {}
-    means = where(table, replica=tuple(run.replicas)).group_by("replica")
-    rows = means.aggregate([(name, "mean") for name in names]).sort_by("replica").to_pylist()
-    return {row["replica"]: tuple(row[f"{name}_mean"] for name in names) for row in rows}
+    groups = where(table, replica=tuple(run.replicas)).group_by("replica")
+    rows = groups.aggregate([(metric, "mean") for metric in metrics]).sort_by("replica")
+    turns, apples = (rows[f"{metric}_mean"].to_pylist() for metric in metrics)
+    return dict(zip(rows["replica"].to_pylist(), zip(turns, apples, strict=True), strict=True))
 
 
 def _median(averages: Mapping[int, tuple[float, float]]) -> tuple[float, float]:
@@ -89,17 +92,17 @@ def _median(averages: Mapping[int, tuple[float, float]]) -> tuple[float, float]:
 
 
 def averages_in_words(run: LoadedRun) -> str:
-    """Return the averages of all replicas in a sentence; "" where there are none."""
+    """Return a sentence with the averages of all replicas; "" for a run without an evaluation."""
     averages = averages_of(run)
     if not averages:
         return ""
-    turns, apples = (_listed(numbers) for numbers in zip(*averages.values(), strict=True))
-    of_replicas = f" of the {len(averages)} replicas" if len(averages) > 1 else ""
-    return f"The trained agents{of_replicas} last {turns} turns on average and pick {apples} apples."
+    turns, apples = map(_list_in_words, zip(*averages.values(), strict=True))
+    replicas = f" of the {len(averages)} replicas" if len(averages) > 1 else ""
+    return f"The trained agents{replicas} last {turns} turns on average and pick {apples} apples."
 
 
-def _listed(numbers: Sequence[float]) -> str:
-    """Return numbers in words; of many the least and the greatest."""
+def _list_in_words(numbers: Sequence[float]) -> str:
+    """Return numbers as "1, 2 and 3", or "1 to 9" if there are many."""
     texts = [f"{number:,.0f}" for number in numbers]
     if len(texts) > _MOST_LISTED:
         return f"{min(numbers):,.0f} to {max(numbers):,.0f}"
@@ -107,7 +110,7 @@ def _listed(numbers: Sequence[float]) -> str:
 
 
 def unstored(game: Game, agents: Sequence[AgentSpec]) -> LoadedRun:
-    """Return a run of scripted agents that stands nowhere on the disk, to be played as stored ones are."""
+    """Return a run of scripted agents that exists only in memory, and is played like a stored run."""
     experiment = Experiment(name="scripted", game=game, agents=tuple(agents), episodes=1, replicas=1)
     nowhere = Path(experiment.name)
     return LoadedRun(
@@ -127,7 +130,7 @@ def fresh_episode(
     episode: int | None = None,
     seed: int | None = None,
 ) -> FreshEpisode:
-    """Return the world and the agents of an episode that is filmed, see `fresh_episodes`."""
+    """Return one fresh episode of one run, see `fresh_episodes`."""
     (fresh,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed)
     return fresh
 
@@ -139,17 +142,20 @@ def fresh_episodes(
     episode: int | None = None,
     seed: int | None = None,
 ) -> list[FreshEpisode]:
-    """Return the worlds and the agents of episodes that are shown together; equal numbers, equal episodes.
+    """Return fresh episodes of several runs that are shown together, all in the same world.
 
-    Without `replica` and `episode` it is a typical one: of each run the replica whose average survival in the
-    run's own evaluation is nearest to the median over replicas, and of the first five episodes the one whose
-    turns and apples are nearest to the medians; the same world for all. Runs in which nobody learned, or
-    without an evaluation, show their first replica, and alone the first episode.
+    By default they are typical. For each run the replica is chosen whose average survival in the run's
+    evaluation is nearest to the median over replicas; then, of the first five episodes, the one whose turns
+    and apples are nearest to the medians of all runs. A run in which nobody learned, or without an
+    evaluation, shows its first replica. If no run has an evaluation, the first episode is shown.
 
     Args:
-        replica, episode: if one of them is given, the other is the first.
-        seed: of the worlds and all chance, none that a run was trained with; by default 20011, or the next
-            with which none was.
+        runs: directories, exported results, or values of `cprl.load`.
+        replica: the number of the replica; 0 by default if `episode` is given.
+        episode: the number of the episode; 0 by default if `replica` is given.
+        seed: the seed of the worlds and of all random choices, with which no run may have been trained; by
+            default 20011, or the next seed that differs from all training seeds. The same numbers give the
+            same episodes.
     """
     if episode is not None:
         episode = checked("episode", episode, Annotated[int, Range(0, 2**32 - 1)])
@@ -157,41 +163,56 @@ def fresh_episodes(
         replica = checked("replica", replica, Natural)
     if seed is not None:
         seed = checked("seed", seed, Seed)
-    loaded = [opened(run) for run in runs]
+    loaded = [as_loaded(run) for run in runs]
     if seed is None:
         seed = fresh_seed(loaded)
     refuse_trained_in(seed, loaded)
     if replica is not None or episode is not None:
         return [_fresh(run, replica, episode or 0, seed) for run in loaded]
-    replicas = [typical_replica(run) for run in loaded]
-    are_known = [bool(averages_of(run)) for run in loaded]
-
-    def played(tried: int) -> list[FreshEpisode]:
-        """Return an episode of all runs, each with its typical replica."""
-        each = zip(loaded, replicas, are_known, strict=True)
-        return [_fresh(run, number, tried, seed)._replace(is_typical=known) for run, number, known in each]
-
-    def distance(tried: int) -> float:
-        """Return how far the turns and the apples of an episode of all runs are from the medians."""
-        return sum(_distance(fresh) for fresh in played(tried) if fresh.is_typical)
-
-    return played(min(range(EPISODES_TRIED), key=distance) if any(are_known) else 0)
+    return _typical_episodes(loaded, seed)
 
 
-def fresh_seed(runs: Sequence[LoadedRun], first: int = SEED) -> int:
-    """Return the first seed from one on with which none of the runs was trained."""
-    trained = {run.experiment.seed for run in runs}
-    return next(seed for seed in count(first) if seed not in trained)
+def _typical_episodes(runs: Sequence[LoadedRun], seed: int) -> list[FreshEpisode]:
+    """Return episodes of the runs' typical replicas in the world that is nearest to their medians."""
+    replicas = [typical_replica(run) for run in runs]
+    has_averages = [bool(averages_of(run)) for run in runs]
+
+    def episodes_in_world(world: int) -> list[FreshEpisode]:
+        return [
+            _fresh(run, replica, world, seed)._replace(is_typical=is_typical)
+            for run, replica, is_typical in zip(runs, replicas, has_averages, strict=True)
+        ]
+
+    def distance(world: int) -> float:
+        return sum(_distance(fresh) for fresh in episodes_in_world(world) if fresh.is_typical)
+
+    if not any(has_averages):
+        return episodes_in_world(0)
+    return episodes_in_world(min(range(EPISODES_TRIED), key=distance))
+
+
+def fresh_seed(runs: Sequence[LoadedRun], first: int = FILM_SEED) -> int:
+    """Return the smallest seed from `first` on with which none of the runs was trained."""
+    training_seeds = {run.experiment.seed for run in runs}
+    return next(seed for seed in count(first) if seed not in training_seeds)
 
 
 def typical_replica(run: LoadedRun) -> int:
-    """Return the replica whose average survival is nearest to the median over replicas, of equal ones that
-    whose harvest is; the first of a run without an evaluation of learned agents."""
+    """Return the replica whose average survival is nearest to the median over replicas.
+
+    If several are equally near, their harvests decide. For a run without an evaluation of trained agents,
+    return the first replica.
+    """
     averages = averages_of(run)
     if not averages:
         return run.replicas[0]
-    turns, apples = _median(averages)
-    return min(averages, key=lambda one: (abs(averages[one][0] - turns), abs(averages[one][1] - apples)))
+    median_turns, median_apples = _median(averages)
+
+    def distances(replica: int) -> tuple[float, float]:
+        turns, apples = averages[replica]
+        return abs(turns - median_turns), abs(apples - median_apples)
+
+    return min(averages, key=distances)
 
 
 def _fresh(run: LoadedRun, replica: int | None, episode: int, seed: int) -> FreshEpisode:
@@ -205,54 +226,60 @@ def _fresh(run: LoadedRun, replica: int | None, episode: int, seed: int) -> Fres
 
 
 def _distance(fresh: FreshEpisode) -> float:
-    """Play an episode; return how far its turns and its apples are from their medians, in shares of these."""
+    """Play an episode; return the sum of the distances of its turns and apples to their medians.
+
+    A distance is relative to its median.
+    """
     median = _median(averages_of(fresh.run))
-    (played,) = evaluate(fresh.env, fresh.policies, explore=True)
-    reached = np.array([played.steps, played.metrics[COLLECTIVE_RETURN]])
-    return float(np.sum(np.abs(reached - median) / np.maximum(1.0, median)))
+    (episode,) = evaluate(fresh.env, fresh.policies, explore=True)
+    outcome = np.array([episode.steps, episode.metrics[COLLECTIVE_RETURN]])
+    return float(np.sum(np.abs(outcome - median) / np.maximum(1.0, median)))
 
 
 class Recorded(NamedTuple):
-    """An episode of T turns of N agents that was played to be shown."""
+    """A played episode of T turns and N agents, with the data of all its turns."""
 
     batches: list[TensorDictBase]
-    """What happened in each turn, batch size [1]."""
-    boards: list[Shown]
-    """The board as the episode began, then after each turn, without what agents observe; none of a game
-    without a board."""
+    """The step of each turn, batch size [1]."""
+    boards: list[WorldView]
+    """The board at the start and after each turn, T + 1 in all, without the agents' observations; empty for a
+    game without a board."""
     episode: Episode
+    """The episode's length, outcome and metrics."""
 
     def entry(self, *key: str, lacking: Any = None) -> Any:
-        """Return an entry of all turns, [T, ...]; another value where the game has none."""
+        """Return an entry of all turns, [T, ...]; the value `lacking` if the game has no such entry."""
         if self.batches[0].get(key, None) is None:
             return lacking
         return np.stack([batch[key][0].numpy(force=True) for batch in self.batches])
 
     @property
     def last(self) -> int:
-        """The last turn."""
+        """Return the number of the last turn."""
         return len(self.batches)
 
     @property
     def left(self) -> int:
-        """Apples on the board at the end."""
+        """Return the number of apples on the board at the end."""
         return int(self.boards[-1].stock.sum())
 
     @property
     def is_dead(self) -> bool:
-        """Whether the board died, since no apple was left and none could grow."""
+        """Return whether the board died: no apple was left and none could grow."""
         return self.episode.terminated and self.left == 0
 
     def since_the_start(self, *key: str) -> Any:
-        """Return an entry of agents at the start and after each turn, [T + 1, N]; zeros where the game has
-        none."""
+        """Return an entry of agents after each turn, with zeros for the start, [T + 1, N].
+
+        All values are zeros if the game has no such entry.
+        """
         values = self.entry(*key, lacking=np.zeros(self.entry(*keys.ACTION).shape))
         return np.concatenate([np.zeros_like(values[:1]), values])
 
 
 @working("playing an episode")
 def record(fresh: FreshEpisode) -> Recorded:
-    """Play an episode, and keep all that happened."""
+    """Play an episode and return it with all its turns."""
     commons = commons_of(fresh.env)
     tracker = tracker_of(fresh.env, fresh.run.metrics)
     played = turns(fresh.env, fresh.policies)
@@ -267,13 +294,14 @@ def record(fresh: FreshEpisode) -> Recorded:
     return Recorded(batches, boards, ended[0])
 
 
-def board_now(env: CommonsEnv) -> Shown:
-    """Return the board of one world without what agents observe."""
+def board_now(env: CommonsEnv) -> WorldView:
+    """Return the current board of the first world, without the agents' observations."""
     board = env.worlds.show(env.output)
     return board._replace(observation=board.observation[:0])
 
 
-def say_which(fresh: Sequence[FreshEpisode]) -> None:
-    """Print which episode of each run is shown, and what its agents come to on average."""
-    for one in fresh:
-        say(f"{f'{one.run.path}: ' if len(fresh) > 1 else ''}{one.words}")
+def print_descriptions(episodes: Sequence[FreshEpisode]) -> None:
+    """Print which episode of each run is shown, and the averages of its trained agents."""
+    for episode in episodes:
+        run = f"{episode.run.path}: " if len(episodes) > 1 else ""
+        say(f"{run}{episode.description}")

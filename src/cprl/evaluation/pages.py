@@ -1,62 +1,77 @@
-"""What is printed and drawn of the table of an evaluation, whatever its kind: cells, and a matrix."""
+"""The printed tables and the drawn matrices that several kinds of evaluation share."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 from cprl.measuring.registry import with_unit
-from cprl.measuring.statistics import Family, notes_on
+from cprl.measuring.statistics import Estimate, Family, notes_on
 from cprl.system.defaults import Fresh
 from cprl.terminal import style
 from cprl.terminal.panels import draw_matrix, matrix_height
 from cprl.terminal.summary import OVER_REPLICAS
-from cprl.terminal.tables import Cell, Cells, Change
+from cprl.terminal.text_tables import Change, TableCell, TextTable
 from cprl.training.stored import LoadedRun
 
 
-def heading(what: str, fresh: Fresh, runs: Iterable[LoadedRun], each: str = "", end: str = "") -> str:
-    """Return what was played, with the epsilon of the agents that learned values, and what numbers are.
+def heading(subject: str, fresh: Fresh, runs: Iterable[LoadedRun], per_part: str = "", end: str = "") -> str:
+    """Return the heading of a table, e.g. "Cross-play: 100 episodes of each of 5 replicas, seed 1, greedy".
 
     Args:
-        each: of what there are so many episodes, beside replicas.
+        subject: what was evaluated.
+        runs: the runs whose agents play; the heading says their epsilon of evaluation.
+        per_part: words that follow the number of episodes, e.g. " in each placement".
+        end: words at the end of the first line.
     """
     agents = [run.agent(agent, replica=run.replicas[0]) for run in runs for agent in range(run.game.agents)]
     epsilons = {agent.epsilon for agent in agents if agent.scripted is None and not agent.stochastic}
-    exploring = ", greedy" if fresh.greedy else "".join(f", epsilon {one:g}" for one in sorted(epsilons))
-    return f"{what}: {fresh}{each}, seed {fresh.seed}{exploring}{end}\n{OVER_REPLICAS}"
+    exploration = "".join(f", epsilon {epsilon:g}" for epsilon in sorted(epsilons))
+    if fresh.greedy:
+        exploration = ", greedy"
+    return f"{subject}: {fresh}{per_part}, seed {fresh.seed}{exploration}{end}\n{OVER_REPLICAS}"
 
 
-def row_cells(family: Family, title: str, *, rewards: str = "") -> Cells:
-    """Return a row for each choice of labels of a family, a column for each of its numbers.
+def row_table(family: Family, title: str, *, rewards: str = "") -> TextTable:
+    """Return estimates as a table: a row for each combination of labels, a column for each metric.
 
     Args:
-        rewards: their unit, see `with_unit`.
+        rewards: the unit of rewards, see `with_unit`.
     """
-    rows: list[list[Cell]] = [
-        [*map(str, labels), *(family[(*labels, number)] for number in family.numbers)]
-        for labels in family.labels
-    ]
-    labels_in_words = (name.replace("_", " ") for name in family.by)
-    head = [*labels_in_words, *(with_unit(number, rewards=rewards) for number in family.numbers)]
-    return Cells(title, head, rows, "\n".join(notes_on(family.values())), texts=len(family.by))
+    rows: list[list[TableCell]] = []
+    for labels in family.labels:
+        row_estimates = [family[(*labels, metric)] for metric in family.numbers]
+        rows.append([*map(str, labels), *row_estimates])
+    label_names = (name.replace("_", " ") for name in family.by)
+    head = [*label_names, *(with_unit(metric, rewards=rewards) for metric in family.numbers)]
+    return TextTable(title, head, rows, "\n".join(notes_on(family.values())), texts=len(family.by))
 
 
-def matrix_cells(family: Family, number: str, title: str, note: str = "") -> Cells:
-    """Return a row for each of the first labels, a column for each of the second, of a number of a family."""
-    rows, columns = _sides(family)
-    cells = {key[:-1]: one for key, one in family.items() if key[-1] == number}
-    texts = {pair: Change(one) if family.name else one for pair, one in cells.items()}
-    return Cells(
-        title,
-        [" \\ ".join(family.by), *columns],
-        [[row, *(texts.get((row, column), "") for column in columns)] for row in rows],
-        note or "\n".join(notes_on(cells.values())),
-    )
+def matrix_table(family: Family, metric: str, title: str, note: str = "") -> TextTable:
+    """Return one metric of a family with two labels as a matrix: rows for the first, columns for the second.
+
+    Args:
+        note: the text below the matrix; by default the notes on its estimates.
+    """
+    row_labels, column_labels = _matrix_labels(family)
+    estimates = _estimates_by_pair(family, metric)
+    cells = {pair: Change(estimate) if family.name else estimate for pair, estimate in estimates.items()}
+    rows: list[list[TableCell]] = []
+    for row_label in row_labels:
+        row_cells = [cells.get((row_label, column_label), "") for column_label in column_labels]
+        rows.append([row_label, *row_cells])
+    head = [" \\ ".join(family.by), *column_labels]
+    return TextTable(title, head, rows, note or "\n".join(notes_on(estimates.values())))
 
 
-def _sides(family: Family) -> tuple[list[str], list[str]]:
-    """Return the first labels of a family and the second, in one order where they are the same."""
-    rows, columns = (list(dict.fromkeys(side)) for side in zip(*family.labels, strict=True))
+def _matrix_labels(family: Family) -> tuple[list[str], list[str]]:
+    """Return the labels of rows and of columns, in the same order if they are the same labels."""
+    rows, columns = (list(dict.fromkeys(labels)) for labels in zip(*family.labels, strict=True))
     return rows, rows if set(rows) == set(columns) else columns
+
+
+def _estimates_by_pair(family: Family, metric: str) -> dict[Any, Estimate]:
+    """Return the estimates of one metric by their labels."""
+    return {key[:-1]: estimate for key, estimate in family.items() if key[-1] == metric}
 
 
 def draw_matrices(
@@ -66,23 +81,25 @@ def draw_matrices(
     *,
     title: str,
     caption: str,
-    more: Mapping[tuple[str, str], str] | None = None,
+    other_cells: Mapping[tuple[str, str], str] | None = None,
     width: style.Width = "page",
 ) -> Path:
-    """Draw numbers of a family that has two labels, a matrix each; a star where one is not 0.
+    """Draw metrics of a family with two labels, one matrix for each; a star marks significant differences.
 
     Args:
-        titles: of the panels, by number.
-        more: texts of cells without a number.
+        titles: the title of each matrix, by its metric.
+        other_cells: the texts of cells for which the family has no estimate.
     """
-    rows, columns = ({name: name for name in side} for side in _sides(family))
-    with style.drawing(path, width=width, colours=style.SHADES) as sheet:
+    rows, columns = (dict(zip(labels, labels, strict=True)) for labels in _matrix_labels(family))
+    with style.drawing(path, width=width, colours=style.PNG_SHADES) as sheet:
         panels = sheet.panels(len(titles), high=matrix_height(len(rows)))
-        for axes, (number, panel_title) in zip(panels, titles.items(), strict=True):
-            cells = {key[:-1]: one for key, one in family.items() if key[-1] == number}
-            texts = {pair: f"{one.value:+.3g}" + " *" * one.differs for pair, one in cells.items()}
-            values = {pair: one.value for pair, one in cells.items()}
-            draw_matrix(sheet, axes, rows, columns, values, {**texts, **(more or {})})
+        for axes, (metric, panel_title) in zip(panels, titles.items(), strict=True):
+            values = {}
+            texts = {}
+            for pair, estimate in _estimates_by_pair(family, metric).items():
+                values[pair] = estimate.value
+                texts[pair] = f"{estimate.value:+.3g}" + " *" * estimate.differs
+            draw_matrix(sheet, axes, rows, columns, values, {**texts, **(other_cells or {})})
             axes.set(xlabel=family.by[1], ylabel=family.by[0])
             axes.set_title(panel_title)
         sheet.title = title

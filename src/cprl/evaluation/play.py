@@ -1,4 +1,4 @@
-"""Play: an episode in which a person decides for one agent, in the terminal, also through a pipe."""
+"""Plays an episode in which a person decides for one agent, in the terminal or through a pipe."""
 
 import os
 import re
@@ -25,14 +25,14 @@ from cprl.commons.game import Game
 from cprl.commons.maps import SIGN_OF_HEADING
 from cprl.commons.published import Variant, check_board
 from cprl.commons.rules import Rules
-from cprl.commons.world import Shown, StepOutput
+from cprl.commons.world import StepOutput, WorldView
 from cprl.envs.make_env import make_env
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.fresh import averages_in_words, board_now, fresh_seed, typical_replica
-from cprl.evaluation.lanes import agent_named, commons_game, refuse_trained_in
+from cprl.evaluation.populations import agent_named, commons_game, refuse_trained_in
 from cprl.experiment import presets
 from cprl.measuring import social
-from cprl.measuring.evaluate import Policy, turns
+from cprl.measuring.playing import Policy, turns
 from cprl.measuring.registry import title
 from cprl.pictures.colours import picture_colour
 from cprl.policies.scripted import SCRIPTED_POLICIES
@@ -57,37 +57,46 @@ KEYS: Final = {
     "c": ("clean", "clean the river"),
     ".": ("stay", "stay"),
 }
-"""The action of each key, and what it is called."""
+"""The action of each key, and its description."""
 QUIT: Final = "quit"
 HELP: Final = "?"
 _ARROWS: Final = {"A": "w", "B": "s", "C": "e", "D": "q"}
 """The key for each arrow, by the last letter that a terminal sends: up, down, right, left."""
-_ENDING: Final = "\x1b\x04"
-"""Esc, and the end of a text."""
-_SIGNS: Final = {APPLE: "A", WATER: maps.WATER, WASTE: maps.WASTE, BEAM: "*", CLEANING: "*"}
+_ENDING_KEYS: Final = "\x1b\x04"
+"""Esc and Ctrl-D, which end the episode."""
+_SIGNS: Final = {
+    APPLE: "A",
+    WATER: maps.SIGN_OF["water"],
+    WASTE: maps.SIGN_OF["waste"],
+    BEAM: "*",
+    CLEANING: "*",
+}
 _PROMPT: Final = "keys> "
-_BY_LINE: Final = f"Enter plays a line of them and alone stays, {HELP} prints them, {QUIT} ends"
-_BY_KEY: Final = f"arrows step and turn, Enter stays, {HELP} prints them, Esc ends"
+_LINE_HELP: Final = f"Enter plays a line of them and alone stays, {HELP} prints them, {QUIT} ends"
+"""The end of the help if keys are typed in lines."""
+_SINGLE_KEY_HELP: Final = f"arrows step and turn, Enter stays, {HELP} prints them, Esc ends"
+"""The end of the help if each key plays at once."""
 
 
 def help_of(game: Game) -> str:
-    """Return all keys of a game in a line: "w step forward, s step back, ..."."""
-    return ", ".join(f"{key} {words}" for key, (action, words) in KEYS.items() if action in game.actions)
+    """Return the keys of a game with their descriptions: "w step forward, s step back, ..."."""
+    return ", ".join(f"{key} {name}" for key, (action, name) in KEYS.items() if action in game.actions)
 
 
 class Session:
-    """The episode, turn by turn.
+    """An episode that a person plays turn by turn.
 
     Args:
         env: one world of a `CommonsEnv`, with or without transforms; it is reset.
-        others: writes the actions of all agents; that of the person's agent is replaced.
-        decision: what the person decides, see `Game.decisions`; None for what `others` write.
+        others: the policy of all agents; the action of the person's agent is replaced.
+        agent: the index of the person's agent.
+        decision: the person's vote, see `Game.decisions`; None for the vote that `others` choose.
     """
 
     about_others: str = ""
-    """Who the others are, in sentences."""
+    """Sentences about the other agents."""
     usual: str = ""
-    """What agents get in whole episodes of this game, in a sentence; "" where that is not known."""
+    """A sentence about the apples that this agent gets on average in an episode; "" if they are unknown."""
 
     def __init__(self, env: EnvBase, others: Policy, *, agent: int = 0, decision: int | None = None) -> None:
         commons = commons_of(env)
@@ -105,31 +114,34 @@ class Session:
         self._action = 0
         self._turns = turns(env, self._choose)
         self._played: list[TensorDictBase] = []
-        self.moments: list[Shown] = [board_now(self._commons)]
-        """The board as the episode began, then after each turn."""
+        self.moments: list[WorldView] = [board_now(self._commons)]
+        """The board at the start of the episode and after each turn."""
 
     @property
     def turn(self) -> int:
+        """Return the number of turns that have been played."""
         return len(self.moments) - 1
 
     @property
     def has_ended(self) -> bool:
-        """Whether the episode has ended: no apple is left and none can grow, or time is over."""
+        """Return whether the episode has ended: no apple is left and none can grow, or time is over."""
         return bool(self._played) and bool(self._played[-1]["next", keys.DONE].any())
 
     @property
     def harvested(self) -> list[int]:
+        """Return the apples that each agent has harvested so far."""
         return [int(apples) for apples in self.moments[-1].harvested]
 
     @property
     def stock(self) -> int:
+        """Return the number of apples on the board."""
         return int(self.moments[-1].stock.sum(dtype=np.int64))
 
     def act(self, action: str) -> StepOutput:
-        """Play a turn: the person's agent takes this action, the others choose theirs.
+        """Play a turn in which the person's agent takes this action.
 
         Returns:
-            What the turn brought, overwritten by the next one.
+            The output of the turn; the next turn overwrites it.
         """
         if action not in self.game.actions:
             raise refusal("action", action, ", ".join(self.game.actions))
@@ -141,8 +153,10 @@ class Session:
         return self._commons.output
 
     def metrics(self) -> dict[str, float]:
-        """Return the metrics of `cprl.measuring.social.summary` of the turns played so far, and stock_left;
-        NaN where undefined, empty before the first turn."""
+        """Return the metrics of the turns so far: those of `cprl.measuring.social.summary`, and stock_left.
+
+        An undefined metric is NaN. Before the first turn there are none.
+        """
         if not self._played:
             return {}
         harvest = torch.cat([batch["next"][keys.HARVEST] for batch in self._played])
@@ -160,55 +174,61 @@ class Session:
 
 
 def state(session: Session) -> str:
-    """Return the turn, the apples on the board, and everybody's score in a line."""
-    scores = [
-        f"{apples} by {'you' if agent == session.agent else f'agent {agent}'}"
-        + ("" if session.moments[-1].in_play[agent] else " (out of play)")
-        for agent, apples in enumerate(session.harvested)
-    ]
-    of_steps = f"turn {session.turn:,} of {session.game.rules.episode_steps:,}"
-    return f"{of_steps}; {session.stock} apples on the board; harvested: {', '.join(scores)}"
+    """Return a line with the turn, the apples on the board, and the score of each agent."""
+    scores = []
+    for agent, apples in enumerate(session.harvested):
+        name = "you" if agent == session.agent else f"agent {agent}"
+        out = "" if session.moments[-1].in_play[agent] else " (out of play)"
+        scores.append(f"{apples} by {name}{out}")
+    turn = f"turn {session.turn:,} of {session.game.rules.episode_steps:,}"
+    return f"{turn}; {session.stock} apples on the board; harvested: {', '.join(scores)}"
 
 
 def happened(session: Session, turn: StepOutput) -> Iterator[str]:
-    """Yield what a turn brought the person, and who tagged whom."""
-    me = session.agent
+    """Yield sentences for the events of a turn: the person's harvest and shot, and who tagged whom."""
+    person = session.agent
     tagged_by = turn.tagged_by[0]
-    if turn.harvest[0, me]:
+    if turn.harvest[0, person]:
         yield "you harvest an apple"
-    if turn.fired[0, me] and not tagged_by[:, me].any():
+    if turn.fired[0, person] and not tagged_by[:, person].any():
         yield "your beam tags nobody out"
-    for tagged, by in zip(*tagged_by.nonzero(), strict=True):
-        whom = "you out" if tagged == me else f"agent {tagged} out"
-        yield f"you tag {whom}" if by == me else f"agent {by} tags {whom}"
+    for tagged, shooter in zip(*tagged_by.nonzero(), strict=True):
+        target = "you out" if tagged == person else f"agent {tagged} out"
+        yield f"you tag {target}" if shooter == person else f"agent {shooter} tags {target}"
 
 
 def play_in_terminal(session: Session, read_keys: Callable[[], str] | None = None) -> None:
-    """Play the episode; in a terminal each key plays at once, through a pipe a line of keys one by one.
+    """Let a person play the episode.
+
+    In a terminal each key plays at once. Through a pipe the keys of each line are played one after the other.
 
     Args:
-        read_keys: returns a line of keys with its newline, or "" at the end; by default what is typed.
+        read_keys: returns a line of keys with its newline, or "" at the end; by default the typed keys.
     """
     if read_keys is not None:
-        _play(session, read_keys, _BY_LINE)
+        _play(session, read_keys, _LINE_HELP)
     elif sys.stdin.isatty():
-        with _single_keys() as pressed:
-            _play(session, pressed, _BY_KEY)
+        with _single_keys() as read_single_key:
+            _play(session, read_single_key, _SINGLE_KEY_HELP)
     else:
-        _play(session, sys.stdin.readline, _BY_LINE)
+        _play(session, sys.stdin.readline, _LINE_HELP)
 
 
-def _play(session: Session, read_keys: Callable[[], str], more: str) -> None:
-    boards = console(width=None if OUT.isatty() else 4 * session.game.map.width + 120)
+def _play(session: Session, read_keys: Callable[[], str], help_end: str) -> None:
+    """Play the episode and print the board, the score and, at the end, the metrics."""
+    width = None if OUT.isatty() else 4 * session.game.map.width + 120
+    boards = console(width=width)
     say(f"You are agent {session.agent}. {session.about_others}".rstrip())
-    _say_keys(session, more)
+    _print_keys(session, help_end)
     while True:
         boards.print(board_text(session), soft_wrap=True)
         say(state(session))
-        if session.has_ended or not _ask_and_play(session, read_keys, more):
+        if session.has_ended or not _ask_and_play(session, read_keys, help_end):
             break
-    ending = "no apple is left" if session.stock == 0 else "time is over"
-    say(f"The end: {ending if session.has_ended else f'stopped after turn {session.turn:,}'}.")
+    ending = f"stopped after turn {session.turn:,}"
+    if session.has_ended:
+        ending = "no apple is left" if session.stock == 0 else "time is over"
+    say(f"The end: {ending}.")
     if session.has_ended and session.usual:
         apples = session.harvested[session.agent]
         say(f"You got {apples} apple{'' if apples == 1 else 's'}. {session.usual}")
@@ -219,17 +239,17 @@ def _play(session: Session, read_keys: Callable[[], str], more: str) -> None:
         say("No turn was played, so there is nothing to measure.")
 
 
-def _say_keys(session: Session, more: str) -> None:
-    """Print the keys in lines that break between keys alone."""
-    keys = f"Keys: {help_of(session.game)}, {more}."
-    joined = ", ".join(key.replace(" ", "\xa0") for key in keys.split(", "))
+def _print_keys(session: Session, help_end: str) -> None:
+    """Print the help in lines that break only between keys."""
+    keys = f"Keys: {help_of(session.game)}, {help_end}."
+    unbreakable = ", ".join(key.replace(" ", "\xa0") for key in keys.split(", "))
     width = console().width if OUT.isatty() else 80
-    for line in wrap(joined, width, break_on_hyphens=False):
+    for line in wrap(unbreakable, width, break_on_hyphens=False):
         say(line.replace("\xa0", " "))
 
 
-def _ask_and_play(session: Session, read_keys: Callable[[], str], more: str) -> bool:
-    """Play the next keys that are known; False where the person leaves."""
+def _ask_and_play(session: Session, read_keys: Callable[[], str], help_end: str) -> bool:
+    """Ask for keys and play them; return False if the person ends the episode."""
     while True:
         OUT.write(_PROMPT)
         OUT.flush()
@@ -242,7 +262,7 @@ def _ask_and_play(session: Session, read_keys: Callable[[], str], more: str) -> 
         if not keys or typed == QUIT:
             return False
         if typed == HELP:
-            _say_keys(session, more)
+            _print_keys(session, help_end)
             continue
         unknown = [key for key in typed if KEYS.get(key, ("",))[0] not in session.game.actions]
         if not unknown:
@@ -258,7 +278,10 @@ def _ask_and_play(session: Session, read_keys: Callable[[], str], more: str) -> 
 
 @contextmanager
 def _single_keys() -> Iterator[Callable[[], str]]:
-    """Make the terminal hand over keys as they are pressed, without showing them."""
+    """Make the terminal deliver each key when it is pressed, without showing it.
+
+    Yield a function that returns the pressed keys.
+    """
     if sys.platform == "win32":
         import msvcrt
 
@@ -267,46 +290,51 @@ def _single_keys() -> Iterator[Callable[[], str]]:
     import termios
     import tty
 
-    before = termios.tcgetattr(sys.stdin)
-    tty.setcbreak(sys.stdin, termios.TCSADRAIN)  # by default what is typed already would be lost
+    settings = termios.tcgetattr(sys.stdin)
+    tty.setcbreak(sys.stdin, termios.TCSADRAIN)  # the default would discard keys that were typed already
     try:
         yield lambda: keys_of(os.read(sys.stdin.fileno(), 64).decode(errors="replace"))
     finally:
-        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, before)
+        termios.tcsetattr(sys.stdin, termios.TCSADRAIN, settings)
 
 
 def keys_of(pressed: str) -> str:
-    """Return the keys of what a terminal sent: arrows step and turn; "" for Esc, and if nothing was sent."""
+    """Return the keys that a terminal sent, with arrows as the keys that they stand for; "" for Esc."""
     keys = re.sub(r"\x1b[\[O]([ABCD])", lambda arrow: _ARROWS[arrow[1]], pressed)
-    return "" if any(key in _ENDING for key in keys) else keys
+    return "" if any(key in _ENDING_KEYS for key in keys) else keys
 
 
 def board_text(session: Session) -> Text:
-    """Return the board by rows: `A` an apple, `#` a wall, `~` and `H` a river's water and waste, `*` a beam,
-    and each agent's number with its heading."""
-    now = session.moments[-1]
-    wide = len(str(session.game.agents - 1)) + 1
-    signs = {**_SIGNS, WALL: "#" * wide}
-    agents = {
-        (int(now.row[agent]), int(now.col[agent])): f"{agent}{SIGN_OF_HEADING[int(now.heading[agent])]}"
-        for agent in np.flatnonzero(now.in_play)
-    }
+    """Return the board by rows, in colours.
+
+    `A` is an apple, `#` a wall, `~` the water of a river and `H` its waste, `*` a beam, and `.` any other
+    cell. An agent has its number and the sign of its heading.
+    """
+    board = session.moments[-1]
+    cell_width = len(str(session.game.agents - 1)) + 1
+    signs = {**_SIGNS, WALL: "#" * cell_width}
+    agent_signs = {}
+    for agent in np.flatnonzero(board.in_play):
+        position = int(board.row[agent]), int(board.col[agent])
+        agent_signs[position] = f"{agent}{SIGN_OF_HEADING[int(board.heading[agent])]}"
     text = Text()
-    for cell, kind in np.ndenumerate(now.board):
-        sign = agents.get(cell, signs.get(int(kind), "."))
+    for cell, kind in np.ndenumerate(board.board):
+        sign = agent_signs.get(cell, signs.get(int(kind), ".")).ljust(cell_width)
+        if cell[1] == board.board.shape[1] - 1:
+            sign = f"{sign.rstrip()}\n"
         red, green, blue = picture_colour(int(kind) or WALL)
-        is_last = cell[1] == now.board.shape[1] - 1
-        text.append(f"{sign}\n" if is_last else sign.ljust(wide), f"rgb({red},{green},{blue})")
+        text.append(sign, f"rgb({red},{green},{blue})")
     text.right_crop()
     return text
 
 
 def board_named(board: str, variant: Variant = "published") -> tuple[Game, LoadedRun | None]:
-    """Return a game, and the run that has it.
+    """Return the game that a name stands for, and its run if the name is a run's directory.
 
     Args:
-        board: the name of a published board, the directory of a run, whose game is played, or a file with a
-            drawing, see `cprl.maps.parse`, played by the published rules.
+        board: the name of a published board; the directory of a run; or a file with a drawing of a board, see
+            `cprl.maps.parse`, which is played by the published rules.
+        variant: the variant of a published board.
     """
     checked("variant", variant, Variant)
     check_board(board)
@@ -318,7 +346,7 @@ def board_named(board: str, variant: Variant = "published") -> tuple[Game, Loade
     if path.is_dir():
         run = load(path)
         return commons_game(run), run
-    return Game(map=maps.read(path), rules=Rules()), None
+    return Game(map=maps.read_file(path), rules=Rules()), None
 
 
 @working("preparing an episode")
@@ -333,34 +361,38 @@ def open_session(
     seed: int | None = None,
     decision: int | None = None,
 ) -> Session:
-    """Begin an episode for a person and others.
+    """Begin an episode for a person and other agents.
 
     Args:
-        others: the directory of a run, whose agents with the same indices play, or a scripted policy; by
-            default the agents of the run that `board` names, else "greedy".
-        replica: the index of the run's replica whose agents play; by default a typical one, see
+        board: the game, see `board_named`.
+        agent: the index of the person's agent.
+        others: the other agents: the directory of a run, whose agents play at their indices, or the name of a
+            scripted policy. By default the agents of the run that `board` names, or else "greedy".
+        replica: the number of the run's replica whose agents play; by default a typical one, see
             `cprl.evaluation.fresh.typical_replica`.
-        steps: turns of the episode at most, in place of those of the game.
-        seed: of all random numbers, none that the others were trained with; by default 40011, or the next
-            with which they were not. Equal seeds and equal actions give equal episodes.
-        decision: what the person decides in a game with votes or elections, 0 to `Game.decisions` - 1; None
-            for a choice by chance, as of a scripted agent.
+        variant: the variant of a published board.
+        steps: the largest number of turns, in place of that of the game.
+        seed: the seed of all random choices, with which the others may not have been trained; by default
+            40011, or the next seed that differs from theirs. The same seed and the same actions give the same
+            episode.
+        decision: the person's vote in a game with votes or elections, 0 to `Game.decisions` - 1; None for a
+            random vote, as scripted agents have.
     """
     game, run = board_named(board, variant)
-    is_whole = steps is None and others in (None, board)
+    is_game_of_run = steps is None and others in (None, board)
     if steps is not None:
         game = replace(game, rules=replace(game.rules, episode_steps=steps))
     agent = checked("agent", agent, Annotated[int, Range(0, game.agents - 1)])
     others = others if others is not None else "greedy" if run is None else board
     if replica and others in SCRIPTED_POLICIES:
         raise ValueError(f'replica is {replica}, and others is "{others}"; allowed: with the agents of a run')
-    stored = _run_of(others, board, run)
-    runs = [] if stored is None else [stored]
+    others_run = _run_of(others, board, run)
+    runs = [] if others_run is None else [others_run]
     if seed is None:
         seed = fresh_seed(runs, PLAY_SEED)
     refuse_trained_in(seed, runs)
-    if replica is None and stored is not None:
-        replica = typical_replica(stored)
+    if replica is None and others_run is not None:
+        replica = typical_replica(others_run)
     specs = [agent_named(others, index, replica=replica or 0, name="others") for index in range(game.agents)]
     specs[agent] = Scripted("random")
     if run is None:
@@ -369,23 +401,25 @@ def open_session(
         env = replace(run, experiment=replace(run.experiment, game=game)).env(seed=seed)
     population = Population(env, specs, seed=seed)
     session = Session(env, population.policy(1), agent=agent, decision=decision)
-    if stored is not None:
-        known = averages_in_words(stored)
-        session.about_others = f"The others are of replica {replica}. {known}".rstrip()
-        session.usual = _usual(stored, agent) if is_whole else ""
+    if others_run is not None:
+        averages = averages_in_words(others_run)
+        session.about_others = f"The others are of replica {replica}. {averages}".rstrip()
+        session.usual = _usual_apples(others_run, agent) if is_game_of_run else ""
     return session
 
 
 def _run_of(others: str, board: str, run: LoadedRun | None) -> LoadedRun | None:
-    """Return the run whose agents play; None for scripted ones, and where there is none."""
+    """Return the run whose agents are the others; None if they are scripted."""
     if others == board:
         return run
     return load(others) if others not in SCRIPTED_POLICIES and Path(others).is_dir() else None
 
 
-def _usual(run: LoadedRun, agent: int) -> str:
-    """Say what an agent gets on average in the run's own evaluation, trained and at random; "" where that is
-    not known."""
+def _usual_apples(run: LoadedRun, agent: int) -> str:
+    """Return a sentence about an agent's average harvest in the run's evaluation, trained and at random.
+
+    Return "" if the run has no such evaluation.
+    """
     apples = []
     for policy in ("trained", "random"):
         path = run.path / "evaluation" / f"{policy}.parquet"

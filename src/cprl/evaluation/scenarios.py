@@ -1,13 +1,13 @@
-"""Scenarios: agents of a stored run among named backgrounds that they never met, called by their focal agents
-and their background, e.g. "minority_among_greedy".
+"""Scenarios: agents of a stored run play among background agents that they never met.
 
 As in Melting Pot (J. Z. Leibo et al., "Scalable Evaluation of Multi-Agent Reinforcement Learning with Melting
-Pot", 2021), focal agents, which are judged, share a board with background agents, which are part of the test.
-A focal majority receives one of the background agents; a focal minority is one agent among them.
+Pot", 2021), focal agents, which are evaluated, share a board with background agents, which are part of the
+test. A focal majority plays with one background agent; a focal minority is one agent among background agents.
+The scenario "minority_among_greedy" has one focal agent among greedy agents.
 
-The focal agents are those of the run, each with its own index. Every placement is played by every replica, in
-the same worlds for the run's agents and for those that it is held against; a number is a replica's mean over
-episodes and placements, estimated over replicas, because only replicas are independent.
+The focal agents are those of the run, each at its own index. Every replica plays every placement of the focal
+agents. Random and greedy agents play in the focal places too, in the same worlds, for comparison. A result is
+the mean over episodes and placements, estimated over replicas, because only replicas are independent.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,21 +20,20 @@ import numpy as np
 import pyarrow as pa
 
 from cprl.commons.game import Game
-from cprl.evaluation.cross_play import OF_BACKGROUND, OF_FOCAL
-from cprl.evaluation.evaluate import opened, refuse_other_games, refuse_unlike
-from cprl.evaluation.lanes import (
-    Agent,
-    Who,
+from cprl.evaluation.cross_play import BACKGROUND_RETURN, FOCAL_RETURN
+from cprl.evaluation.evaluate import as_loaded, refuse_other_games, refuse_unlike
+from cprl.evaluation.pages import heading, row_table
+from cprl.evaluation.populations import (
+    AgentOfReplica,
     agents_of,
     fresh_for,
-    frozen,
-    play,
+    frozen_agent,
+    join_tables,
+    play_fresh,
     roles_of,
-    said,
-    scripted,
-    together,
+    scripted_agent,
+    table_note,
 )
-from cprl.evaluation.pages import heading, row_cells
 from cprl.experiment import presets
 from cprl.measuring.registry import COLLECTIVE_RETURN, EQUALITY
 from cprl.measuring.statistics import Family, differences, estimates
@@ -45,29 +44,30 @@ from cprl.system.working import working
 from cprl.terminal import style
 from cprl.terminal.panels import draw_dots
 from cprl.terminal.summary import OVER_REPLICAS
-from cprl.terminal.tables import Cell, Cells, Change
+from cprl.terminal.text_tables import Change, TableCell, TextTable
 from cprl.training.agents import check_scripted
 from cprl.training.stored import LoadedRun, load
 from cprl.values import Value, Where, refusal
 
 Focal: TypeAlias = Literal["majority", "minority"]
-"""How many agents are focal: "majority", all but one; "minority", one."""
+"""How many agents of a scenario are focal: in a "majority" all but one, in a "minority" one."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Scenario(Value, stored=False):
-    """A background on a board, and how many of the agents are focal."""
+    """A game, its background agents, and how many of its agents are focal."""
 
     name: Annotated[str, Where(str.isidentifier, "letters, digits and underscores, not a digit first")]
-    """What it is called, e.g. "minority_among_greedy"."""
+    """The name of the scenario, e.g. "minority_among_greedy"."""
     game: Game
-    """The board with its rules, for at least 2 agents; scripted policies need windows as observations."""
+    """The game, for at least 2 agents. Scripted policies need windows as observations."""
     focal: Focal
-    """How many agents are focal, see `Focal`; in a game of two agents both are one."""
+    """Whether the focal agents are a majority or a minority. With two agents both are one agent."""
     background: tuple[Scripted | Frozen, ...]
-    """Who plays with each agent index where it is not focal. `Frozen(run, agent, replica=None)` is, beside
-    replica r of the focal run, the agent of the next replica that its own run keeps, the first one after
-    the last: so agents of one replica, trained together or from the same seed, never meet."""
+    """The background agent for each index, which plays unless this index is focal. With replica r of the
+    focal run, `Frozen(run, agent, replica=None)` plays as the agent of the frozen run's replica after r
+    (after the last, the first), so that agents of one replica, trained together or from the same seed, never
+    meet."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -78,21 +78,23 @@ class Scenario(Value, stored=False):
             )
 
     @property
-    def placements(self) -> tuple[Who, ...]:
-        """The indices of the focal agents in turn, so that every agent is focal equally often: as a minority
-        each alone, as a majority all without agent 0, without agent 1 and so on."""
-        everyone = range(self.game.agents)
-        is_minority = self.focal == "minority"
-        return tuple(
-            tuple(agent for agent in everyone if (agent == alone) == is_minority) for alone in everyone
-        )
+    def placements(self) -> list[tuple[int, ...]]:
+        """Return the indices of the focal agents in each placement.
+
+        Every agent is focal equally often: a minority is each agent in turn, and a majority leaves out each
+        agent in turn.
+        """
+        agents = tuple(range(self.game.agents))
+        if self.focal == "minority":
+            return [(agent,) for agent in agents]
+        return [agents[:left_out] + agents[left_out + 1 :] for left_out in agents]
 
 
 SCRIPTED: Final = ("greedy", "sustainable", "territorial", "aggressive")
-"""Backgrounds in which all agents follow one scripted policy."""
+"""Backgrounds in which all agents follow one scripted policy, each named after the policy."""
 
 STORED: Final = "dqn"
-"""The background of the population that DQN trained on the very game, where one is committed."""
+"""The background of agents that DQN trained on the same game, for games with committed agents."""
 
 _COMMITTED: Final[tuple[tuple[presets.Board, presets.Variant, bool, str], ...]] = (
     ("commons", "as_run", True, "commons"),
@@ -100,18 +102,19 @@ _COMMITTED: Final[tuple[tuple[presets.Board, presets.Variant, bool, str], ...]] 
     ("two_complex", "as_run", True, "two_complex"),
     ("two_complex", "as_run", False, "two_complex_no_beam"),
 )
-"""Board, variant, whether agents may fire, and the folder of `docs/results` with the population."""
+"""The committed populations: board, variant, whether agents may fire, and their folder in `docs/results`."""
 
 
 def results_folder() -> Path:
-    """Return the folder with the results that come with a checkout of cprl, which is `docs/results`; an
-    installed wheel has none."""
+    """Return the folder `docs/results` of a checkout of cprl; with an installed wheel it does not exist."""
     return Path(__file__).parents[3] / "docs" / "results"
 
 
 def stored_for(game: Game) -> Path | None:
-    """Return the folder of the committed population that was trained on a game, whether it is at hand or not;
-    None if there is none."""
+    """Return the folder of the committed population that was trained on a game; None if there is none.
+
+    The folder exists only in a checkout of cprl.
+    """
     for board, variant, may_fire, name in _COMMITTED:
         published = presets.game(board, variant=variant)
         if game == replace(published, rules=replace(published.rules, may_fire=may_fire)):
@@ -120,7 +123,7 @@ def stored_for(game: Game) -> Path | None:
 
 
 def left_out_of(game: Game) -> str:
-    """Say which scenarios of a game are not at hand and why; "" if all are."""
+    """Return in words which scenarios of a game are missing and why; "" if none is."""
     folder = stored_for(game)
     if folder is None or folder.is_dir():
         return ""
@@ -153,6 +156,7 @@ def scenarios_of(game: Game) -> tuple[Scenario, ...]:
 
 
 def check_game(game: Any, name: str = "the game") -> None:
+    """Refuse a game that scripted agents cannot play, or that has fewer than two agents."""
     if not isinstance(game, Game):
         raise refusal(name, game, "a cprl.Game, because scripted agents read its windows")
     if game.agents < 2:
@@ -162,13 +166,15 @@ def check_game(game: Any, name: str = "the game") -> None:
 
 
 def _modes(game: Game) -> tuple[Focal, ...]:
+    """Return the kinds of scenarios of a game; with two agents a majority and a minority are the same."""
     return ("minority",) if game.agents == 2 else ("majority", "minority")
 
 
-RUN: Final = "run"
-FOCAL_AGENTS: Final = (RUN, "random", "greedy")
-"""Who takes the focal places: the run's agents, or agents that follow a scripted policy."""
+RUN_AGENTS: Final = "run"
+FOCAL_AGENTS: Final = (RUN_AGENTS, "random", "greedy")
+"""The agents that take the focal places: those of the run, or agents that follow a scripted policy."""
 BY: Final = ("scenario", FOCAL)
+"""The labels of a result."""
 
 
 @working("playing scenarios")
@@ -178,62 +184,82 @@ def run_scenarios(
     *,
     scenarios: Sequence[str | Scenario] = (),
 ) -> pa.Table:
-    """Let the agents of a stored run play scenarios in the focal places, and random and greedy agents in
-    these places, in the same worlds.
+    """Let the agents of a stored run play scenarios as the focal agents.
+
+    Random and greedy agents play in the same places and worlds, for comparison.
 
     Args:
-        fresh: which episodes, in each placement.
-        scenarios: names of `scenarios_of` the run's game, or scenarios of your own on the same game; by
-            default all that it has.
+        run: the directory of the run, its exported results, or a value of `cprl.load`.
+        fresh: the number of episodes in each placement, their seed, and the replicas that play.
+        scenarios: names from `scenarios_of` the run's game, or scenarios of one's own for the same game; by
+            default all that the game has.
 
     Returns:
-        A row for each population, replica, episode and agent, see `cprl.measuring.table`, by "scenario",
-        "focal", who takes the focal places: "run", "random" or "greedy", and "focal_agents", their indices,
-        e.g. "0 2 3".
+        A table with a row for each scenario, focal agents, placement, replica, episode and agent, see
+        `cprl.measuring.table`. The column "scenario" has the scenario's name, "focal" says "run", "random" or
+        "greedy", and "focal_agents" has the indices of the focal agents, e.g. "0 2 3".
     """
-    loaded = opened(run)
+    loaded = as_loaded(run)
     check_game(loaded.game)
-    everyone = range(loaded.game.agents)
-    check_scripted([(Scripted("greedy"), tuple(everyone))], loaded.spaces, loaded.game)
-    chosen = _chosen(loaded, scenarios)
-    specs = [spec for scenario in chosen for spec in scenario.background]
-    stored = {path: load(path) for path in {spec.run: None for spec in specs if isinstance(spec, Frozen)}}
-    for path, background_run in stored.items():
-        refuse_other_games({str(loaded.path): loaded, f"the background {path}": background_run})
-    fresh = fresh_for([loaded], fresh, among=stored.values())
-    backgrounds = {
-        scenario.name: [_background(spec, stored, loaded, fresh.replicas) for spec in scenario.background]
-        for scenario in chosen
-    }
-    populations = {RUN: agents_of(loaded)}
-    populations |= {policy: [scripted(policy)] * len(everyone) for policy in FOCAL_AGENTS[1:]}
+    count = loaded.game.agents
+    check_scripted([(Scripted("greedy"), tuple(range(count)))], loaded.spaces, loaded.game)
+    chosen = _choose_scenarios(loaded, scenarios)
+    background_runs = _load_background_runs(loaded, chosen)
+    fresh = fresh_for([loaded], fresh, among=background_runs.values())
 
-    def parts(scenario: Scenario) -> Iterator[pa.Table]:
-        background = backgrounds[scenario.name]
-        for (who, focal), places in product(populations.items(), scenario.placements):
-            agents = [focal[agent] if agent in places else background[agent] for agent in everyone]
-            labels = {"scenario": scenario.name, FOCAL: who, "focal_agents": " ".join(map(str, places))}
-            yield play(fresh, loaded, agents, labels, roles=roles_of(len(everyone), places))
+    def background_of(scenario: Scenario) -> list[AgentOfReplica]:
+        return [
+            _background_agent(spec, background_runs, loaded, fresh.replicas) for spec in scenario.background
+        ]
 
-    is_all = {scenario.name for scenario in chosen} >= {one.name for one in scenarios_of(loaded.game)}
-    return together(
-        (part for scenario in chosen for part in parts(scenario)),
+    backgrounds = {scenario.name: background_of(scenario) for scenario in chosen}
+    populations = {RUN_AGENTS: agents_of(loaded)}
+    for policy in FOCAL_AGENTS[1:]:
+        populations[policy] = [scripted_agent(policy)] * count
+
+    def placement_tables() -> Iterator[pa.Table]:
+        for scenario in chosen:
+            background = backgrounds[scenario.name]
+            for (name, focal), placement in product(populations.items(), scenario.placements):
+                agents = [focal[agent] if agent in placement else background[agent] for agent in range(count)]
+                indices = " ".join(map(str, placement))
+                labels = {"scenario": scenario.name, FOCAL: name, "focal_agents": indices}
+                yield play_fresh(fresh, loaded, agents, labels, roles=roles_of(count, placement))
+
+    played_names = {scenario.name for scenario in chosen}
+    all_names = {scenario.name for scenario in scenarios_of(loaded.game)}
+    missing = left_out_of(loaded.game) if played_names >= all_names else ""
+    return join_tables(
+        placement_tables(),
         heading=heading(f"Scenarios of {loaded.path.name}", fresh, [loaded], " in each placement"),
         run=loaded.path.name,
         fresh=fresh,
         weights=loaded.weights_from,
-        scenarios_left_out=left_out_of(loaded.game) if is_all else "",
+        scenarios_left_out=missing,
     )
 
 
-def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenario]:
-    """Return the scenarios by their names or as they are, checked against the run's game."""
-    named = {scenario.name: scenario for scenario in scenarios_of(run.game)}
+def _load_background_runs(run: LoadedRun, scenarios: Sequence[Scenario]) -> dict[str, LoadedRun]:
+    """Load the runs of all frozen background agents, by their paths; refuse runs of other games."""
+    background_runs: dict[str, LoadedRun] = {}
+    for scenario in scenarios:
+        for spec in scenario.background:
+            if isinstance(spec, Frozen) and spec.run not in background_runs:
+                background_runs[spec.run] = load(spec.run)
+    for path, background_run in background_runs.items():
+        refuse_other_games({str(run.path): run, f"the background {path}": background_run})
+    return background_runs
+
+
+def _choose_scenarios(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenario]:
+    """Return the scenarios that are given by name or as values; refuse those of another game."""
+    by_name = {scenario.name: scenario for scenario in scenarios_of(run.game)}
     chosen: dict[str, Scenario] = {}
-    for given in scenarios or named:
-        if isinstance(given, str) and given not in named:
-            raise refusal("a scenario", given, f"{', '.join(named)}; {left_out_of(run.game)}".rstrip("; "))
-        scenario = named[given] if isinstance(given, str) else given
+    for choice in scenarios or by_name:
+        if isinstance(choice, str) and choice not in by_name:
+            allowed = f"{', '.join(by_name)}; {left_out_of(run.game)}".rstrip("; ")
+            raise refusal("a scenario", choice, allowed)
+        scenario = by_name[choice] if isinstance(choice, str) else choice
         if scenario.name in chosen:
             raise ValueError(f"{scenario.name} is given twice; allowed: scenarios with different names")
         refuse_unlike(f"{run.path} and the scenario {scenario.name}", run.game, scenario.game)
@@ -241,99 +267,116 @@ def _chosen(run: LoadedRun, scenarios: Sequence[str | Scenario]) -> list[Scenari
     return list(chosen.values())
 
 
-def _background(
-    spec: Scripted | Frozen, stored: Mapping[str, LoadedRun], run: LoadedRun, replicas: Sequence[int]
-) -> Agent:
-    """Return who plays in a background beside these replicas of a run; refuse one that would meet itself."""
+def _background_agent(
+    spec: Scripted | Frozen,
+    background_runs: Mapping[str, LoadedRun],
+    focal_run: LoadedRun,
+    replicas: Sequence[int],
+) -> AgentOfReplica:
+    """Return the background agent that a specification describes.
+
+    Args:
+        background_runs: the runs of frozen agents, by their paths.
+        focal_run: the run of the focal agents.
+        replicas: the replicas of the focal run that play.
+
+    Raises:
+        ValueError: if a frozen agent would meet an agent of the same replica and seed.
+    """
     if isinstance(spec, Scripted):
-        return scripted(spec.policy)
-    other = stored[spec.run]
+        return scripted_agent(spec.policy)
+    background_run = background_runs[spec.run]
     if spec.replica is not None:
-        return frozen(other, spec)
-    beside = {replica: _following(other, replica) for replica in replicas}
-    is_alike = other.experiment.seed == run.experiment.seed
-    if is_alike and any(replica == number for replica, number in beside.items()):
+        return frozen_agent(background_run, spec)
+    stored_replicas = {replica: _next_replica(background_run, replica) for replica in replicas}
+    has_same_seed = background_run.experiment.seed == focal_run.experiment.seed
+    if has_same_seed and any(replica == stored for replica, stored in stored_replicas.items()):
         raise ValueError(
-            f"the background {other.path} keeps the single replica {other.replicas[0]} of the same seed as "
-            f"{run.path}; allowed: a run of at least 2 replicas, one of another seed, or a Frozen with the "
-            "number of its replica"
+            f"the background {background_run.path} keeps the single replica {background_run.replicas[0]} of "
+            f"the same seed as {focal_run.path}; allowed: a run of at least 2 replicas, one of another seed, "
+            "or a Frozen with the number of its replica"
         )
-    return agents_of(other, beside)[spec.agent]
+    return agents_of(background_run, stored_replicas)[spec.agent]
 
 
-def _following(run: LoadedRun, replica: int) -> int:
-    """Return the number of the replica of a background that plays beside this one: of those that it keeps the
-    next, the first after the last."""
-    numbers = run.replicas  # some may be missing
-    before = numbers.index(replica) if replica in numbers else replica
-    return numbers[(before + 1) % len(numbers)]
+def _next_replica(run: LoadedRun, replica: int) -> int:
+    """Return the replica of a run after this one; after the last replica the first."""
+    replicas = run.replicas  # not always 0, 1, 2 and so on: a user may have kept only some
+    index = replicas.index(replica) if replica in replicas else replica
+    return replicas[(index + 1) % len(replicas)]
 
 
-SOCIAL: Final = (COLLECTIVE_RETURN, EQUALITY, "sustainability", "survival_steps", "peacefulness")
-"""The social metrics on the page; others are in the table."""
+_METRICS_ON_PAGE: Final = (COLLECTIVE_RETURN, EQUALITY, "sustainability", "survival_steps", "peacefulness")
+"""The social metrics that are printed; the table has more."""
 
 
-def advantages(table: pa.Table, numbers: Sequence[str] = (OF_FOCAL, OF_BACKGROUND)) -> Family:
-    """Return what the run's agents get more than others would in their places, "focal/return", and what the
-    background gets more among them, "background/return", by "scenario" and "focal", these others. Paired by
-    replica, which plays the same worlds."""
-    behind = differences(table, numbers, BY, {FOCAL: RUN})
-    return behind.changed(lambda _, one: -one)
+def scenario_advantages(
+    table: pa.Table, numbers: Sequence[str] = (FOCAL_RETURN, BACKGROUND_RETURN)
+) -> Family:
+    """Return how much more agents get with the run's agents in the focal places than with scripted agents.
+
+    "focal/return" compares the agents in the focal places, and "background/return" the background agents.
+    Differences are paired by replica, because all play the same worlds.
+
+    Returns:
+        The differences, by "scenario" and "focal", the scripted agents of the comparison.
+    """
+    disadvantages = differences(table, numbers, BY, {FOCAL: RUN_AGENTS})
+    return disadvantages.changed(lambda _, difference: -difference)
 
 
-def scenario_cells(table: pa.Table) -> Iterator[Cells]:
-    """Yield the returns, a row for each scenario, and social metrics of all agents together."""
-    levels = estimates(table, [OF_FOCAL, OF_BACKGROUND], BY)
-    ahead = advantages(table, [OF_FOCAL])
-    names = list(dict.fromkeys(scenario for scenario, _ in levels.labels))
-    others = FOCAL_AGENTS[1:]
-    returns: list[list[Cell]] = [
-        [
-            name,
-            *(levels[name, who, OF_FOCAL] for who in FOCAL_AGENTS),
-            *(Change(ahead[name, who, OF_FOCAL]) for who in others),
-            levels[name, RUN, OF_BACKGROUND],
-        ]
-        for name in names
-    ]
-    columns = ["scenario", "focal: the run's agents", *(f"{who} in their place" for who in others)]
-    columns += [*(f"run's - {who}'s, paired" for who in others), "background"]
-    missing = said(table, "scenarios_left_out")
-    note = ahead.note("of this table") + f"\nLeft out: {missing}" * bool(missing)
-    yield Cells("return per agent, apples", columns, returns, note)
-    social = estimates(where(table, focal=RUN), SOCIAL, "scenario")
-    yield row_cells(social, "all agents together, with the run's agents in the focal places")
+def scenario_tables(table: pa.Table) -> Iterator[TextTable]:
+    """Yield a table of returns with a row for each scenario, and a table of social metrics."""
+    levels = estimates(table, [FOCAL_RETURN, BACKGROUND_RETURN], BY)
+    advantages = scenario_advantages(table, [FOCAL_RETURN])
+    scripted = FOCAL_AGENTS[1:]
+    rows: list[list[TableCell]] = []
+    for name in dict.fromkeys(scenario for scenario, _ in levels.labels):
+        returns = [levels[name, focal, FOCAL_RETURN] for focal in FOCAL_AGENTS]
+        changes = [Change(advantages[name, policy, FOCAL_RETURN]) for policy in scripted]
+        rows.append([name, *returns, *changes, levels[name, RUN_AGENTS, BACKGROUND_RETURN]])
+    columns = ["scenario", "focal: the run's agents", *(f"{policy} in their place" for policy in scripted)]
+    columns += [*(f"run's - {policy}'s, paired" for policy in scripted), "background"]
+    missing = table_note(table, "scenarios_left_out")
+    note = advantages.note("of this table") + f"\nLeft out: {missing}" * bool(missing)
+    yield TextTable("return per agent, apples", columns, rows, note)
+    social = estimates(where(table, focal=RUN_AGENTS), _METRICS_ON_PAGE, "scenario")
+    yield row_table(social, "all agents together, with the run's agents in the focal places")
 
 
 _LOOKS: Final = {
-    (RUN, OF_FOCAL): ("o", style.MEAN, "focal agents: the run's"),
-    ("greedy", OF_FOCAL): ("s", style.MARK, "greedy in their place"),
-    ("random", OF_FOCAL): ("D", "#8a8a8a", "random in their place"),
-    (RUN, OF_BACKGROUND): ("|", "#000000", "background agents, beside the run's"),
+    (RUN_AGENTS, FOCAL_RETURN): ("o", style.MEAN, "focal agents: the run's"),
+    ("greedy", FOCAL_RETURN): ("s", style.MARK, "greedy in their place"),
+    ("random", FOCAL_RETURN): ("D", "#8a8a8a", "random in their place"),
+    (RUN_AGENTS, BACKGROUND_RETURN): ("|", "#000000", "background agents, beside the run's"),
 }
-"""Marker, colour and name of each number."""
-_ROW: Final = 4.4
-"""The height of a scenario in em."""
-_BAND: Final = 0.16
-"""The distance between two numbers of a scenario, in rows."""
+"""The marker, the colour and the name of each result: the agents in the focal places, and whose return."""
+_ROW_EM: Final = 4.4
+"""The height of a scenario's row, in em."""
+_RESULT_SPACING: Final = 0.16
+"""The distance between two results of a scenario, as a share of a row."""
 
 
 def draw_scenarios(table: pa.Table, path: Path | str, *, width: style.Width = "page") -> Path:
-    """Draw the mean return per agent, a row for each scenario: of the run's agents in the focal places, of
-    greedy and of random ones there, and of the background; intervals by Student's t."""
-    levels = estimates(table, [OF_FOCAL, OF_BACKGROUND], BY)
+    """Draw the mean returns per agent with their intervals by Student's t, in one row for each scenario.
+
+    A row shows the run's agents, greedy agents and random agents in the focal places, and the background.
+    """
+    levels = estimates(table, [FOCAL_RETURN, BACKGROUND_RETURN], BY)
     names = list(dict.fromkeys(scenario for scenario, _ in levels.labels))
     rows = np.arange(len(names))
     with style.drawing(path, width=width) as sheet:
-        (axes,) = sheet.panels(1, high=_ROW * len(rows) + 4)
-        for place, ((who, number), (marker, colour, label)) in enumerate(_LOOKS.items()):
-            means = [levels[name, who, number] for name in names]
-            at = list(rows + _BAND * (place - (len(_LOOKS) - 1) / 2))
-            draw_dots(axes, at, means, across=True, color=colour, marker=marker, label=label)
+        (axes,) = sheet.panels(1, high=_ROW_EM * len(rows) + 4)
+        for index, ((focal, metric), (marker, colour, label)) in enumerate(_LOOKS.items()):
+            means = [levels[name, focal, metric] for name in names]
+            positions = list(rows + _RESULT_SPACING * (index - (len(_LOOKS) - 1) / 2))
+            draw_dots(axes, positions, means, across=True, color=colour, marker=marker, label=label)
         for row in rows[1:]:
             axes.axhline(row - 0.5, color="#dddddd", linewidth=0.8)
         axes.set_yticks(rows, [style.wrapped(name.replace("_", " "), 0.3 * sheet.width_em) for name in names])
         axes.set(ylim=(len(rows) - 0.5, -0.5), xlabel="return per agent, apples")
-        sheet.title = f"{said(table, 'run')}: returns by scenario"
-        sheet.caption = f"{said(table, 'fresh')} in each placement, the same worlds for all; {OVER_REPLICAS}."
+        sheet.title = f"{table_note(table, 'run')}: returns by scenario"
+        sheet.caption = (
+            f"{table_note(table, 'fresh')} in each placement, the same worlds for all; {OVER_REPLICAS}."
+        )
     return Path(path)

@@ -1,6 +1,6 @@
-"""One HTML page that shows episodes of stored agents side by side: it opens from the disk, without a network.
+"""Shows episodes of stored agents side by side on one HTML page, which opens from the disk without a network.
 
-`show.html`, beside this module, draws what is handed to it here.
+This module collects the data; `show.html`, beside it, is the page that draws them.
 """
 
 import json
@@ -22,10 +22,10 @@ from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.film import check_titles, titles_of
-from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episodes, record, say_which
-from cprl.evaluation.lanes import commons_game
-from cprl.measuring.episodes import Episode
+from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episodes, print_descriptions, record
+from cprl.evaluation.populations import commons_game
 from cprl.measuring.social import equality
+from cprl.measuring.tracker import Episode
 from cprl.pictures.colours import GREY, PALETTE, agent_colour, agent_mark, line_colour
 from cprl.pictures.image import EMPTY_SITE_COLOUR
 from cprl.pictures.readable import NO_RULES, growth_of, legend_of, meaning_of, rules_of
@@ -36,15 +36,17 @@ from cprl.training.stored import LoadedRun
 from cprl.values import refusal
 from cprl.viewer.pictures import regions_of
 
-MOST_RUNS: Final = 6
+_MOST_RUNS: Final = 6
+"""The largest number of runs on a page."""
 _COLOURS: Final = {
     **{name: PALETTE[kind] for name, kind in (("wall", WALL), ("apple", APPLE), ("beam", BEAM))},
     **{name: PALETTE[kind] for name, kind in (("water", WATER), ("waste", WASTE), ("cleaning", CLEANING))},
     "empty": EMPTY_SITE_COLOUR,
 }
 _IN_PLAY: Final = 4
+"""The bit of an agent's pose that says that it is in play. The two lowest bits are its heading, 0 to 3."""
 _VIOLATED: Final = 8
-"""Bits of a pose, beside the heading of 0 to 3."""
+"""The bit of an agent's pose that says that it broke a rule in the turn."""
 
 
 @working("making a page")
@@ -58,64 +60,69 @@ def show(
     episode: int | None = None,
     seed: int | None = None,
 ) -> tuple["Page", tuple[Episode, ...]]:
-    """Show an episode of a run's agents, beside the agents of other runs if there are any, as one HTML page.
+    """Show an episode of a run's agents as an HTML page, beside the agents of other runs if any are given.
 
-    It is the episode that `cprl.evaluation.film.film` records with the same numbers, by default a typical
-    one, see `cprl.evaluation.fresh`; which one it is stands on the page.
+    The episode is the one that `cprl.evaluation.film.film` records with the same numbers, by default a
+    typical one, see `cprl.evaluation.fresh`. The page says which one it is.
 
     Args:
-        out: the page, an .html, complete or absent; by default `show-<replica>-<episode>.html` in the
-            directory of the first run.
-        beside: at most five more runs. Games may differ; where they do not, all play the same fresh world.
-        titles: one for each run; by default what `cprl.evaluation.film.Style` says.
+        run: the run's directory.
+        out: the page, an .html file; by default `show-<replica>-<episode>.html` in the directory of the first
+            run. It is written completely or not at all.
+        beside: at most five further runs. Runs of the same game play in the same fresh world.
+        titles: a title for each run; for the default see `cprl.evaluation.film.Style`.
+        replica: the number of the replica.
+        episode: the number of the episode.
+        seed: the seed of the worlds and of all random choices.
 
     Returns:
-        The page, which a notebook shows, and the episode of each run.
+        The page, which a notebook displays, and the episode of each run.
 
     Raises:
         FileExistsError: if the page exists.
     """
     runs = (run, *beside)
-    if len(runs) > MOST_RUNS:
-        raise refusal("beside", f"{len(runs) - 1} runs", f"at most {MOST_RUNS - 1}")
+    if len(runs) > _MOST_RUNS:
+        raise refusal("beside", f"{len(runs) - 1} runs", f"at most {_MOST_RUNS - 1}")
     check_titles(tuple(titles), len(runs))
     if out is not None:
         Page(out).refuse()
     fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
-    by_default = Path(run) / f"show-{fresh[0].replica}-{fresh[0].episode}.html"
-    path = Page(by_default if out is None else out)
+    default_path = Path(run) / f"show-{fresh[0].replica}-{fresh[0].episode}.html"
+    path = Page(out or default_path)
     path.refuse()
-    say_which(fresh)
+    print_descriptions(fresh)
     data, episodes = data_of(fresh, titles)
     path.write(page(_heading(fresh, data), begins(commons_game(fresh[0].run)), data))
     return path, tuple(episodes)
 
 
 def begins(game: Game) -> str:
-    """Return what a page says above its episodes, as HTML."""
+    """Return the paragraph above the episodes, which says how apples grow, as HTML."""
     return f"<p>{escape(growth_of(game))}</p>"
 
 
 def _heading(fresh: Sequence[FreshEpisode], data: dict[str, Any]) -> str:
-    """Return the title of the population, or what differs between several."""
+    """Return the title of a page: that of its single run, or how the agents and rules of its runs differ."""
     if len(fresh) == 1:
         return str(data["populations"][0]["title"])
     runs = [population.run for population in fresh]
     agents = {learned(run.specs) for run in runs}
-    rules = {(run.game.rules, run.game.institutions, run.experiment.own_rules) for run in runs}
-    alike = "Same" if len(agents) == 1 else "Different"
-    who = "learners" if all(run.networks for run in runs) else "agents"
-    return f"{alike} {who}, {'the same rules' if len(rules) == 1 else 'different rules'}"
+    rules = {(run.game.rules, run.game.institutions, run.experiment.custom_rules) for run in runs}
+    adjective = "Same" if len(agents) == 1 else "Different"
+    agents_text = "learners" if all(run.networks for run in runs) else "agents"
+    rules_text = "the same rules" if len(rules) == 1 else "different rules"
+    return f"{adjective} {agents_text}, {rules_text}"
 
 
 class Page(type(Path())):  # type: ignore[misc]
-    """The path of a page, which draws itself in a notebook."""
+    """The path of a page. A notebook displays the page itself."""
 
     HEIGHT = 900
-    """Pixels in a notebook."""
+    """The height of the page in a notebook, in pixels."""
 
     def refuse(self) -> None:
-        """Refuse names of other files than pages, and to write over one."""
+        """Refuse a path that does not end in .html, or that exists."""
         if self.suffix != ".html":
             raise refusal("out", str(self), "a file whose name ends in .html")
         refuse_to_write_over(self)
@@ -136,9 +143,11 @@ def page(
     """Return the text of a page.
 
     Args:
-        before, after: HTML above and below the episode.
-        data: of `data_of`; None to show no episode.
-        live: JavaScript that runs after the page's own.
+        title: the title of the page.
+        before: HTML above the episode.
+        data: the episode, as `data_of` returns it; None for a page without an episode.
+        after: HTML below the episode.
+        live: JavaScript that runs after that of the page.
     """
     template = files("cprl.evaluation").joinpath("show.html").read_text(encoding="utf-8")
     encoded = json.dumps(data or {"populations": []}, separators=(",", ":")).replace("<", "\\u003c")
@@ -149,12 +158,12 @@ def page(
 def data_of(
     fresh: Sequence[FreshEpisode], titles: Sequence[str] = ()
 ) -> tuple[dict[str, Any], Sequence[Episode]]:
-    """Play the episodes of these populations; return the data of `show.html` about them, and the episodes."""
+    """Play the episodes; return the data that `show.html` draws, and the episodes."""
     games = [commons_game(population.run) for population in fresh]
     recorded = [record(population) for population in fresh]
-    each = zip(titles or titles_of(fresh), fresh, recorded, strict=True)
+    populations = zip(titles or titles_of(fresh), fresh, recorded, strict=True)
     return {
-        "populations": [_population(*one) for one in each],
+        "populations": [_population(*population) for population in populations],
         "palette": _COLOURS,
         "axis": max(played.last for played in recorded),
         "most": max(int(played.boards[-1].harvested.max()) for played in recorded),
@@ -163,7 +172,7 @@ def data_of(
 
 
 def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, Any]:
-    """Return what the page shows of a population."""
+    """Return the data about one run's agents, in the form that `show.html` reads."""
     game = commons_game(fresh.run)
     board = game.map
     agents = range(game.agents)
@@ -187,7 +196,7 @@ def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, 
     ]
     return {
         "title": title,
-        "which": fresh.words,
+        "which": fresh.description,
         "about": about(fresh.run),
         "outcome": outcome,
         "isDead": played.is_dead,
@@ -208,55 +217,49 @@ def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, 
 
 
 def about(run: LoadedRun) -> str:
-    """Say who plays, under which rules, in sentences."""
-    return f"{_players(run)} {_rules(run)}"
-
-
-def _players(run: LoadedRun) -> str:
-    """Say who plays, for readers who do not know what a learner is."""
-    who = learned(run.specs)
-    if not run.networks:
-        return f"Computer players: {who}."
-    return f"Computer players that learned by practice: {who}, {run.experiment.trained_for}."
-
-
-def _rules(run: LoadedRun) -> str:
+    """Return sentences about a run's agents and rules for readers who know nothing of learning agents."""
     game = commons_game(run)
     experiment = run.experiment
-    words = [meaning_of(kind, game) for kind in game.institutions]
+    agents = learned(run.specs)
+    if run.networks:
+        sentences = [f"Computer players that learned by practice: {agents}, {experiment.trained_for}."]
+    else:
+        sentences = [f"Computer players: {agents}."]
+    sentences += [meaning_of(kind, game) for kind in game.institutions]
     if game.institutions:
-        words.append(f"Settings: {rules_of(game)}.")
-    elif not experiment.own_rules:
-        words.append(f"Rules: {NO_RULES}.")
-    return " ".join([*words, experiment.own_code]).strip()
+        sentences.append(f"Settings: {rules_of(game)}.")
+    elif not experiment.custom_rules:
+        sentences.append(f"Rules: {NO_RULES}.")
+    return " ".join([*sentences, experiment.custom_code]).strip()
 
 
-def _cells(board: Map, places: Sequence[Sequence[int]]) -> list[int]:
-    """Return the indices of cells, row by row."""
-    return [row * board.width + col for row, col, *_ in places]
+def _cells(board: Map, positions: Sequence[Sequence[int]]) -> list[int]:
+    """Return the indices of cells, counted row by row, from positions that begin with (row, col)."""
+    return [row * board.width + col for row, col, *_ in positions]
 
 
 def _turns(board: Map, played: Recorded) -> dict[str, NDArray[Any]]:
-    """Return what changes from turn to turn: arrays [turns, ...], bits packed.
+    """Return the data that change from turn to turn as arrays [turns, ...]; bits are packed into bytes.
 
-    `beams` has the cells of all turns one after the other, those of turn t from `beam_first[t]` on and before
-    `beam_first[t + 1]`; the number of cells is added to those of a beam that cleans.
+    `beams` has the indices of the cells that a beam lights, of all turns one after the other. Those of turn t
+    are `beams[beam_first[t] : beam_first[t + 1]]`. To the index of a cell that is being cleaned the number of
+    cells of the board is added.
     """
 
-    def of_all(name: str) -> NDArray[Any]:
-        return np.stack([getattr(one, name) for one in played.boards])
+    def stacked(name: str) -> NDArray[Any]:
+        return np.stack([getattr(board_in_turn, name) for board_in_turn in played.boards])
 
-    harvested = of_all("harvested")
-    stock = of_all("stock")
-    boards = of_all("board").reshape(len(stock), -1)
+    harvested = stacked("harvested")
+    stock = stacked("stock")
+    boards = stacked("board").reshape(len(stock), -1)
     is_violated = played.since_the_start("next", *keys.VIOLATED) > 0
-    pose = of_all("heading") + _IN_PLAY * of_all("in_play") + _VIOLATED * is_violated
+    pose = stacked("heading") + _IN_PLAY * stacked("in_play") + _VIOLATED * is_violated
     turns, lit = np.nonzero(np.concatenate([boards == BEAM, boards == CLEANING], 1))
     return {
         "stock": np.packbits(stock, axis=1),
         "waste": np.packbits(boards[:, _cells(board, board.river)] == WASTE, axis=1),
         "stocked": stock.sum(1, dtype=np.uint32),
-        "cell": (of_all("row") * board.width + of_all("col")).astype(np.uint32),
+        "cell": (stacked("row") * board.width + stacked("col")).astype(np.uint32),
         "pose": pose.astype(np.uint8),
         "harvested": harvested.astype(np.uint32),
         "equality": equality(harvested).astype(np.float32),
@@ -266,7 +269,10 @@ def _turns(board: Map, played: Recorded) -> dict[str, NDArray[Any]]:
 
 
 def _packed(arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return arrays one after the other as deflated bytes, and the name, type and length of each."""
+    """Return arrays joined and compressed for JSON, with the name, the type and the length of each.
+
+    The bytes are little-endian, compressed by zlib and encoded in base64.
+    """
     raw = b"".join(values.astype(values.dtype.newbyteorder("<")).tobytes() for values in arrays.values())
     lengths = [
         (name, f"{values.dtype.kind}{values.itemsize}", values.size) for name, values in arrays.items()

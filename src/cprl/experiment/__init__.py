@@ -16,6 +16,6 @@ __all__ = ["Experiment", "changes"]
 
 
 def __getattr__(name: str) -> Any:
-    if name in __all__:  # with which comes torch, which the published games do without
+    if name in __all__:  # imports torch, which the published games do not need
         return getattr(import_module("cprl.experiment.experiment"), name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,4 +1,4 @@
-"""Experiment: everything that decides a training, as a value that a run's recipe holds."""
+"""Experiment: all settings of a training, as a value that the recipe of a run holds."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -11,7 +11,7 @@ from cprl.algorithms.base import TeamAlgorithm
 from cprl.commons.game import Game
 from cprl.envs.make_env import PlayableGame, game_of, stored_game
 from cprl.experiment.engine import Engine, engine_of
-from cprl.measuring.episodes import check_own_metrics
+from cprl.measuring.tracker import check_custom_metrics
 from cprl.objectives.rewards import check_reward
 from cprl.pictures.readable import game_html
 from cprl.population import (
@@ -26,7 +26,7 @@ from cprl.population import (
 )
 from cprl.runs.files import RECIPE_FORMAT, written_by_another
 from cprl.runs.length import Length
-from cprl.runs.recipe import recipe_config, rules_of_own, with_runs_moved
+from cprl.runs.recipe import custom_rules_in, recipe_config, with_runs_moved
 from cprl.runs.schedule import OnNan, Schedule
 from cprl.system.memory import Device
 from cprl.values import (
@@ -39,11 +39,11 @@ from cprl.values import (
     build,
     checked,
     custom_targets,
-    described,
-    differences,
+    describe_changes,
+    describe_customs,
     hints_of,
     refusal,
-    shown,
+    short_repr,
     to_config,
 )
 
@@ -54,51 +54,51 @@ MOST_SEED: Final = 2**64 - 2
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Experiment(Value, stored=False, called="experiment"):
-    """What is trained and how; equals what `recipe.json` holds.
+    """A training as a value: the game, its agents, and how they are trained.
 
-    Lists become tuples, though type checkers ask for tuples. Two are equal where their recipes are, of
-    which "auto" says the engine that it stands for.
+    `recipe.json` holds all of it. Lists become tuples, though type checkers ask for tuples. Two experiments
+    are equal if their recipes are, with "auto" replaced by the engine that it stands for.
     """
 
     name: DirectoryName
-    """What it is called: of the recipe, and of the run's directory."""
+    """The name of the recipe, and of the run's directory."""
     game: Game | Custom | PlayableGame
-    """What is played."""
+    """The game that is played."""
     agents: tuple[AgentSpec, ...]
-    """How each agent is specified; see `cprl.population`."""
+    """The specification of each agent; see `cprl.population`."""
     episodes: Positive | None = None
-    """Episodes that each replica trains, in all its worlds together; or say `steps`."""
+    """Episodes that each replica trains, in all its worlds together; None with `steps`."""
     steps: Annotated[int, Range(1, MOST_INT64)] | None = None
-    """Steps that each replica trains, a turn of W worlds being W; or say `episodes`."""
+    """Steps that each replica trains, W in each turn of W worlds; None with `episodes`."""
     replicas: Annotated[int, Range(1, 2**20)] = 1
     """Independent repetitions R of the whole training, side by side."""
     worlds: Annotated[int, Range(1, 2**20)] = 1
-    """Worlds W in which each replica plays at once, and from all of which its agents learn."""
+    """Worlds W in which each replica plays side by side, and from which its agents learn."""
     seed: Annotated[int, Range(0, MOST_SEED)] = 0
-    """Of chance, weights, exploration and replay."""
+    """The seed of the game, initial weights, exploration and replay."""
     evaluation_episodes: Annotated[int, Range(1, 2**20)] = 20
     """Fresh episodes of each replica after training, and of the random policy."""
     evaluate_every: Positive | None = None
-    """Episodes after which agents play as many fresh episodes greedily, again and again; None for never."""
+    """Episodes between greedy evaluations in fresh episodes during training; None for no evaluation."""
     update_every: Positive = 1
-    """Environment steps k after which agents learn, then k times."""
+    """Turns k between updates; agents then update k times."""
     transforms: tuple[Custom, ...] = ()
     """TorchRL transforms of the environment, the first one nearest to it."""
     callbacks: tuple[Custom, ...] = ()
     """Callbacks of the training; see `cprl.training`."""
     metrics: tuple[Custom, ...] = ()
-    """Metrics of your own: functions of an episode that return a number; see docs/metrics.md."""
+    """Custom metrics: functions of an episode that return a number; see docs/metrics.md."""
     loggers: tuple[LoggerName | Custom, ...] = ()
     """TorchRL's loggers that get every series: "tensorboard", "wandb", or one of your own."""
     device: Device = "cpu"
-    """Where agents learn, e.g. "cpu" or "cuda:0"."""
+    """The device where agents learn, e.g. "cpu" or "cuda:0"."""
     engine: Engine = "auto"
-    """How updates are computed: "compiled" by torch, several times faster and in need of a C++ compiler;
-    "eager", the same uncompiled; "auto", a short training "eager" and a long one "compiled", see
-    `cprl.experiment.engine`; "torchrl", stock TorchRL, one agent after the other."""
+    """The engine that computes updates: "compiled" by torch, several times faster, needs a C++ compiler;
+    "eager" is the same uncompiled; "auto" takes "eager" for a short training and "compiled" for a long one,
+    see `cprl.experiment.engine`; "torchrl" is stock TorchRL, one agent after the other."""
     on_nan: OnNan = "stop"
-    """What happens when a loss, weight, reward or observation is NaN or infinite: "stop" ends the training;
-    "continue" warns, and the others train on."""
+    """The reaction to a loss, weight, reward or observation that is NaN or infinite: "stop" ends the
+    training; "continue" warns, and the other agents train on."""
 
     def __repr__(self) -> str:
         return (
@@ -107,50 +107,53 @@ class Experiment(Value, stored=False, called="experiment"):
         )
 
     def _repr_html_(self) -> str:
-        who, game = "", f"<p>{escape(repr(self.game))}</p>"
+        training = self.trained_for
+        game = f"<p>{escape(repr(self.game))}</p>"
         if isinstance(self.game, Game):
-            who = f"{learned(specs_by_agent(self.agents, self.game.agents))}, "
-            game = game_html(self.game, self.own_rules)
-        code = f"<p>{escape(self.own_code)}</p>" if self.own_code else ""
-        return f"<p><b>{escape(self.name)}</b>: {escape(who + self.trained_for)}.</p>{game}{code}"
+            training = f"{learned(specs_by_agent(self.agents, self.game.agents))}, {training}"
+            game = game_html(self.game, self.custom_rules)
+        code = f"<p>{escape(self.custom_code)}</p>" if self.custom_code else ""
+        return f"<p><b>{escape(self.name)}</b>: {escape(training)}.</p>{game}{code}"
 
     @property
-    def own_rules(self) -> str:
-        """The rules of the user's own in words, a transform or a game each; "" without any."""
-        return rules_of_own(self.to_config())
+    def custom_rules(self) -> str:
+        """Return a description of custom rules, of a transform or a game; "" without any."""
+        return custom_rules_in(self.to_config())
 
     @property
-    def own_code(self) -> str:
-        """All that is of the user's own, by the field where it stands, in a sentence; "" without any."""
-        parts = {name: described(part) for name, part in self.to_config().items()}
-        said = "; ".join(f"{name}: {', '.join(words)}" for name, words in parts.items() if words)
-        return f"Code of its own: {said}." if said else ""
+    def custom_code(self) -> str:
+        """Return a sentence about all user code, by field; "" without any."""
+        descriptions = []
+        for name, part in self.to_config().items():
+            customs = ", ".join(describe_customs(part))
+            descriptions += [f"{name}: {customs}"] if customs else []
+        return f"Code of its own: {'; '.join(descriptions)}." if descriptions else ""
 
     @property
     def title(self) -> str:
-        """What a figure, a summary or a recording of it is called."""
+        """Return the title of its figures, summary and recording."""
         return f"{self.name}, {self.trained_in}, {self.length}"
 
     @property
     def trained_for(self) -> str:
-        """How long it trains, in words."""
+        """Return the length and the replicas in words."""
         return f"trained for {self.length} in {self.trained_in}"
 
     @property
     def trained_in(self) -> str:
-        """Its replicas, and their worlds where they have several, in words."""
+        """Return the replicas, and their worlds if there are several, in words."""
         worlds = f" of {self.worlds:,} worlds" if self.worlds > 1 else ""
         return f"{self.replicas} replica{'s' * (self.replicas > 1)}{worlds}"
 
     @property
     def length(self) -> Length:
-        """How long each replica trains."""
+        """Return the length of the training of each replica."""
         clock = getattr(getattr(self.game, "rules", None), "episode_steps", None)
         return Length.of(vars(self), clock)
 
     @property
     def schedule(self) -> Schedule:
-        """How long each replica trains, in how many worlds, and when its agents learn."""
+        """Return the length, the worlds of each replica, and how often its agents learn."""
         return Schedule(**{name: getattr(self, name) for name in hints_of(Schedule)})
 
     def __post_init__(self) -> None:
@@ -160,7 +163,7 @@ class Experiment(Value, stored=False, called="experiment"):
         if isinstance(self.game, PlayableGame):
             checked("experiment.game.agents", self.game.agents, Positive)
         self.to_config()
-        check_own_metrics(self.metrics)
+        check_custom_metrics(self.metrics)
         _check_numbers(self)
         _check_agents(self, self.schedule)
         _check_engine(self)
@@ -172,15 +175,16 @@ class Experiment(Value, stored=False, called="experiment"):
 
     @classmethod
     def from_config(cls, table: Mapping[str, Any]) -> "Experiment":
-        """Return the experiment that `to_config` gave; of the modules that it names a game's is imported."""
+        """Return the experiment of a table of `to_config`; of the modules that it names only the game's is
+        imported."""
         read = build(cls, table, "experiment")
         return read if not isinstance(read.game, Custom) else replace(read, game=game_of(read.game))
 
     def to_recipe(self, directory: str | Path | None = None) -> dict[str, Any]:
-        """Return what `recipe.json` says of it; `cprl.runs.recipe.start_run` adds when and by what.
+        """Return the content of `recipe.json`; `cprl.runs.recipe.start_run` adds the time and versions.
 
         Args:
-            directory: where the recipe is kept: runs of `Frozen` are then given relative to it.
+            directory: the directory of the recipe, to which runs of `Frozen` agents are then relative.
         """
         table = self.to_config()
         table = table if directory is None else with_runs_moved(table, ".", directory)
@@ -191,7 +195,8 @@ class Experiment(Value, stored=False, called="experiment"):
         """Return the experiment of a recipe, as `recipe.json` holds it.
 
         Args:
-            directory: where the recipe is kept; runs of `Frozen` are then relative to where we stand.
+            directory: the directory of the recipe; runs of `Frozen` agents become relative to the working
+                directory.
         """
         try:
             table = recipe_config(recipe)
@@ -203,15 +208,16 @@ class Experiment(Value, stored=False, called="experiment"):
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Experiment):
             return NotImplemented
-        ours, theirs = ({**each.to_config(), "engine": engine_of(each)} for each in (self, other))
-        return ours == theirs
+        tables = [{**each.to_config(), "engine": engine_of(each)} for each in (self, other)]
+        return tables[0] == tables[1]
 
     def __hash__(self) -> int:
         return hash((self.name, self.length, self.replicas, self.seed))
 
 
 def changes(before: Experiment, now: Experiment) -> list[str]:
-    return differences(before.to_config(), now.to_config(), "experiment", Experiment)
+    """Return the differences between two experiments, a sentence for each."""
+    return describe_changes(before.to_config(), now.to_config(), "experiment", Experiment)
 
 
 _MOST_WORLDS: Final = 2**22
@@ -240,10 +246,12 @@ def _check_agents(experiment: Experiment, schedule: Schedule) -> None:
             refuse_undecided(experiment.agents, len(getattr(experiment.game, "ballots", ())))
         except ValueError as error:
             raise ValueError(f"experiment.agents: {error}") from error
-    for place, spec in enumerate(experiment.agents):
-        where = f"experiment.agents[{place}]"
-        if (stored := stored_of(spec)) is not None:
-            _check_stored(where if stored is spec else f"{where}.start_from", stored, experiment.replicas)
+    for index, spec in enumerate(experiment.agents):
+        where = f"experiment.agents[{index}]"
+        stored = stored_of(spec)
+        if stored is not None:
+            field = where if stored is spec else f"{where}.start_from"
+            _check_stored(field, stored, experiment.replicas)
         if isinstance(spec, Learning | Team) and not isinstance(experiment.game, Custom):
             check_reward(f"{where}.reward", spec.reward, experiment.game.agents)
         if isinstance(spec, Team) and isinstance(spec.algorithm, TeamAlgorithm):
@@ -266,7 +274,7 @@ def _check_stored(where: str, stored: Frozen, replicas: int) -> None:
         )
     if isinstance(stored.replica, tuple) and len(stored.replica) != replicas:
         raise ValueError(
-            f"{where}.replica is {shown(stored.replica)}, of {len(stored.replica)} numbers; allowed: "
+            f"{where}.replica is {short_repr(stored.replica)}, of {len(stored.replica)} numbers; allowed: "
             f"{replicas} of them, one for each replica of the experiment; one number for all; or None"
         )
 
@@ -274,10 +282,10 @@ def _check_stored(where: str, stored: Frozen, replicas: int) -> None:
 def _check_engine(experiment: Experiment) -> None:
     if experiment.engine != "torchrl":
         return
-    for place, spec in enumerate(experiment.agents):
+    for index, spec in enumerate(experiment.agents):
         if isinstance(spec, Team) or (isinstance(spec, Learning) and isinstance(spec.algorithm, Tabular)):
             what = "a Team" if isinstance(spec, Team) else "Tabular"
             raise ValueError(
-                f'experiment.agents[{place}] is {what}, which engine="torchrl" cannot train; allowed: '
+                f'experiment.agents[{index}] is {what}, which engine="torchrl" cannot train; allowed: '
                 '"auto", "compiled", "eager"'
             )

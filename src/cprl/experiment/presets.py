@@ -3,14 +3,16 @@
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from cprl.commons.published import BOARDS as BOARDS
-from cprl.commons.published import GAMES as GAMES
-from cprl.commons.published import VARIANTS as VARIANTS
-from cprl.commons.published import Board as Board
-from cprl.commons.published import Variant as Variant
-from cprl.commons.published import check_variant
-from cprl.commons.published import game as game
-from cprl.commons.published import names as names
+from cprl.commons.published import (
+    BOARDS as BOARDS,
+    GAMES as GAMES,
+    VARIANTS as VARIANTS,
+    Board as Board,
+    Variant as Variant,
+    check_variant,
+    game as game,
+    names as names,
+)
 
 if TYPE_CHECKING:
     from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
@@ -21,7 +23,7 @@ if TYPE_CHECKING:
 def gymnasium_env(
     board: str, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
 ) -> "CommonsGymnasiumEnv":
-    """A game for its first agent alone as a Gymnasium environment, for `gymnasium.make`."""
+    """Return a published game with one agent as a Gymnasium environment, for `gymnasium.make`."""
     from cprl.commons.maps import with_agents
     from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
 
@@ -33,14 +35,14 @@ def gymnasium_env(
 def pettingzoo_env(
     board: str, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
 ) -> "CommonsParallelEnv":
-    """A game as a PettingZoo environment, for `pettingzoo.make`."""
+    """Return a published game as a PettingZoo environment, for `pettingzoo.make`."""
     from cprl.envs.pettingzoo_env import CommonsParallelEnv
 
     return CommonsParallelEnv(game(board, variant=variant), seed=seed, render_mode=render_mode)
 
 
 def dqn_settings(board: Board, *, variant: Variant = "published") -> "DQNSettings":
-    """The hyperparameters of the DQN agents on a board.
+    """Return the hyperparameters of the DQN agents on a board.
 
     The text gives the decay of epsilon on `commons` as 1,000,000 steps; versions of the program have
     500,000, 1,000,000 and, the last one, 5,000,000. All variants use the value of the text. Versions of the
@@ -50,20 +52,22 @@ def dqn_settings(board: Board, *, variant: Variant = "published") -> "DQNSetting
     from cprl.learners.settings import DQNSettings
 
     check_variant(board, variant)
-    as_run = variant != "published"
-    return DQNSettings(
-        gamma=0.995,
-        epsilon_decay_steps=1_000_000 if board == "commons" else 500_000,
-        relu_on_outputs=as_run,
-        glorot_uniform=as_run,
-        adam_eps=1e-7 if as_run else 1e-8,
-        own_target_weights=as_run,
-        mean_over_all_outputs=as_run,
+    decay_steps = 1_000_000 if board == "commons" else 500_000
+    settings = DQNSettings(gamma=0.995, epsilon_decay_steps=decay_steps)
+    if variant == "published":
+        return settings
+    return replace(
+        settings,
+        relu_on_outputs=True,
+        glorot_uniform=True,
+        adam_eps=1e-7,
+        own_target_weights=True,
+        mean_over_all_outputs=True,
     )
 
 
 def variant_of(played: object) -> Variant | None:
-    """The variant of a published game, whether agents may fire or not; None for any other game."""
+    """Return the variant of a published game, with or without a beam; None for any other game."""
     from cprl.commons.game import Game
 
     if not isinstance(played, Game) or played.institutions:

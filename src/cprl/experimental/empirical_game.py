@@ -1,18 +1,19 @@
-"""play_empirical_game: the game whose strategies are stored runs, and whose payoffs are their returns.
-analyse: what it amounts to, with what replicas leave open.
+"""Empirical games: each agent chooses one of several stored runs to play for it, and gets its return.
 
-For N agents and S runs every composition is played, so many agents of one run and so many of the next:
-C = (N + S - 1)! / (N! (S - 1)!), each shifted by one index at a time, so that each run has each index as
-often as every other. An agent plays as the run's agent with its index, replica r with replica r.
+`play_empirical_game` measures the payoffs of the game, and `analyse` finds its equilibria and dynamics.
 
-`pairwise_game` makes a game of two agents of what `crossplay` played. For N = 2 it is the same game; for more
-agents a reduction that knows what the first agent gains who deviates from the run of all others, and nothing
-of mixes; its equilibria in which one run is played are those of the whole game, the others need not be.
+A composition says how many of the N agents play as each of the S runs. All C = (N + S - 1)! / (N! (S - 1)!)
+compositions are played. In each, the runs take turns over the agents' indices. The agent with index i plays
+as agent i of its run, and replica r as replica r.
 
-The means over replicas are one game, which is analysed. Only replicas are independent, so the bootstrap draws
-as many with replacement, the same ones for all payoffs, and analyses the game of their means anew: the
-interval of a run's share is that between the 2.5 and the 97.5 per cent quantiles, and an equilibrium is as
-certain as the share of these games that have it. With few replicas such intervals are too narrow.
+`pairwise_game` builds a game of two agents from a cross-play, which is cheaper. For N = 2 it is the same
+game. For more agents it is a reduction: it knows what a single agent gains that deviates from all others, but
+no other compositions. Its equilibria with a single run are equilibria of the whole game; others need not be.
+
+The game of the mean payoffs over replicas is analysed. Intervals come from a bootstrap over replicas, since
+only replicas are independent: it draws replicas with replacement, the same ones for all payoffs, and analyses
+the game of their means. The interval of a run's share is between the 2.5 % and 97.5 % quantiles, and the
+certainty of an equilibrium is the share of resamples that have it. Few replicas give too narrow intervals.
 """
 
 from collections import Counter
@@ -28,9 +29,9 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.axes import Axes
 
-from cprl.evaluation.cross_play import OF_FOCAL, PAIR, Runs, named_runs
-from cprl.evaluation.lanes import agents_of, fresh_for, play, said, shifted, together
-from cprl.evaluation.pages import heading, matrix_cells
+from cprl.evaluation.cross_play import FOCAL_RETURN, PAIR, Runs, named_runs
+from cprl.evaluation.pages import heading, matrix_table
+from cprl.evaluation.populations import agents_of, fresh_for, join_tables, play_fresh, rotations, table_note
 from cprl.experimental.payoff_table import PayoffTable, compositions
 from cprl.experimental.solutions import (
     MOST_PROFILES,
@@ -43,24 +44,32 @@ from cprl.experimental.solutions import (
     replicator,
     replicator_ends,
 )
-from cprl.measuring.statistics import CONFIDENCE, HOLM, Estimate, Family, curve_interval, estimate, judged
+from cprl.measuring.statistics import (
+    CONFIDENCE,
+    HOLM_NOTE,
+    Estimate,
+    Family,
+    curve_interval,
+    estimate,
+    judge_family,
+)
 from cprl.measuring.table import FOCAL, ROLE, by_replica
 from cprl.system.defaults import EGTA_RESAMPLES, Fresh
-from cprl.system.working import say_how_far, working
+from cprl.system.working import note_progress, working
 from cprl.terminal import style
 from cprl.terminal.panels import draw_line, draw_matrix, matrix_height
-from cprl.terminal.tables import Cells
+from cprl.terminal.text_tables import TextTable
 from cprl.values import Range, checked
-from cprl.values.arrays import Float64
+from cprl.values.array_types import Float64
 
 COMPOSITION: Final = "composition"
-"""The label that says how many agents play as each run."""
+"""The label of a table for the composition: how many agents play as each run."""
 _EACH: Final = " for each choice of who plays where"
 
 
 @working("playing all compositions")
 def play_empirical_game(runs: Runs, fresh: Fresh = Fresh(episodes=5)) -> pa.Table:
-    """Let agents of runs play in all compositions.
+    """Play all compositions of the agents of several runs.
 
     Args:
         runs: at least two runs of the same game, as for `crossplay`. With S runs and N agents up to 256
@@ -72,42 +81,45 @@ def play_empirical_game(runs: Runs, fresh: Fresh = Fresh(episodes=5)) -> pa.Tabl
         many agents play as each run, and "runs", the names of all agents' runs; "role" is the name of the
         agent's own.
     """
-    named = named_runs(runs)
-    names = list(named)
-    agents = named[names[0]].game.agents
-    profiles = len(named) ** agents
+    by_name = named_runs(runs)
+    names = list(by_name)
+    agents = by_name[names[0]].game.agents
+    profiles = len(names) ** agents
     if profiles > MOST_PROFILES:
         raise ValueError(
-            f"{len(named)} runs of {agents} agents have {profiles:,} profiles; allowed: at most "
+            f"{len(names)} runs of {agents} agents have {profiles:,} profiles; allowed: at most "
             f"{MOST_PROFILES}; crossplay and pairwise_game (cprl egta --pairwise) take more"
         )
-    fresh = fresh_for(named.values(), fresh)
-    of_runs = [agents_of(run) for run in named.values()]
+    fresh = fresh_for(by_name.values(), fresh)
+    stored = [agents_of(run) for run in by_name.values()]
     parts: list[pa.Table] = []
-    for counts in compositions(agents, len(named)).tolist():
-        for who in shifted(counts):
-            say_how_far(len(parts), None, "populations")
-            mixed = [of_runs[run][agent] for agent, run in enumerate(who)]
-            roles = [names[run] for run in who]
+    for counts in compositions(agents, len(names)).tolist():
+        for choice in rotations(counts):
+            note_progress(len(parts), None, "populations")
+            mixed = [stored[run][agent] for agent, run in enumerate(choice)]
+            roles = [names[run] for run in choice]
             labels = {COMPOSITION: composition_text(counts, names), "runs": " ".join(roles)}
-            parts.append(play(fresh, named[roles[0]], mixed, labels, roles=roles, among=named.values()))
-    title = heading("Empirical game", fresh, named.values(), _EACH)
-    return together(parts, heading=title, fresh=fresh)
+            parts.append(
+                play_fresh(fresh, by_name[roles[0]], mixed, labels, roles=roles, among=by_name.values())
+            )
+    title = heading("Empirical game", fresh, by_name.values(), _EACH)
+    return join_tables(parts, heading=title, fresh=fresh)
 
 
 def pairwise_game(played: pa.Table) -> pa.Table:
-    """Return the table of a cross-play as that of the game of two agents that it makes, see the docstring of
-    this module.
+    """Return the table of a cross-play under the heading of an empirical game.
 
-    The diagonal of the cross-play says who plays where both play as one run.
+    The rows stay as they are: `games_in` reads a table with the column `FOCAL` as a game of two agents, whose
+    payoffs are the returns of focal and background agents. The diagonal of the cross-play holds the episodes
+    in which both play as the same run.
     """
     kind = "Empirical game" if _agents_in(played) == 2 else "Pairwise reduction of the empirical game"
-    title = said(played, "heading").replace("Cross-play", kind, 1)
+    title = table_note(played, "heading").replace("Cross-play", kind, 1)
     return played.replace_schema_metadata({**(played.schema.metadata or {}), b"heading": title.encode()})
 
 
 def games_in(table: pa.Table) -> tuple[list[str], list[PayoffTable]]:
-    """Return the names of the strategies of a table's game, and what it pays in each replica.
+    """Return the names of the runs in a table, and the game that each replica measured.
 
     Args:
         table: of `play_empirical_game` or `pairwise_game`.
@@ -116,10 +128,12 @@ def games_in(table: pa.Table) -> tuple[list[str], list[PayoffTable]]:
     if FOCAL in table.column_names:
         names = table[FOCAL].unique().to_pylist()
         pairs = list(product(names, repeat=2))
-        means = _values(by_replica(table, OF_FOCAL, PAIR), ("replica", *PAIR), "value")
-        matrices = [np.array([means[replica, *pair] for pair in pairs]) for replica in replicas]
-        size = len(names), len(names)
-        return names, [PayoffTable.of_pairs(matrix.reshape(size)) for matrix in matrices]
+        means = _values(by_replica(table, FOCAL_RETURN, PAIR), ("replica", *PAIR), "value")
+        games = []
+        for replica in replicas:
+            payoffs = np.array([means[replica, *pair] for pair in pairs])
+            games.append(PayoffTable.from_pairs(payoffs.reshape(len(names), len(names))))
+        return names, games
     names = table[ROLE].unique().to_pylist()
     agents = _agents_in(table)
     keys = ("replica", COMPOSITION, ROLE)
@@ -135,17 +149,17 @@ def games_in(table: pa.Table) -> tuple[list[str], list[PayoffTable]]:
 
 
 def _values(table: pa.Table, keys: Sequence[str], value: str) -> dict[tuple[Any, ...], float]:
-    """Return a column by the values of others."""
+    """Return the values of a column by the values of other columns."""
     columns = (table[name].to_pylist() for name in keys)
     return dict(zip(zip(*columns, strict=True), table[value].to_pylist(), strict=True))
 
 
 def _agents_in(table: pa.Table) -> int:
-    """Return how many agents play in each episode of a table."""
+    """Return the number of agents in each episode of a table."""
     return int(pc.max(table["agent"]).as_py()) + 1
 
 
-def mean_of(games: Sequence[PayoffTable]) -> PayoffTable:
+def mean_game(games: Sequence[PayoffTable]) -> PayoffTable:
     """Return the game of the mean payoffs."""
     payoffs = np.mean([game.payoffs for game in games], 0)
     return PayoffTable(agents=games[0].agents, payoffs=payoffs)
@@ -153,42 +167,46 @@ def mean_of(games: Sequence[PayoffTable]) -> PayoffTable:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Analysis:
-    """What an empirical game of S runs amounts to; see the docstring of this module."""
+    """The analysis of an empirical game of S runs; see the module's docstring."""
 
     names: Sequence[str]
-    """Of the runs."""
+    """The names of the runs."""
     games: Sequence[PayoffTable] = field(repr=False)
-    """What each replica pays."""
-    of_agents: int
-    """The agents of the game that was played; more than those of `games` where these are a reduction."""
+    """The game that each replica measured."""
+    played_agents: int
+    """The number of agents of the game that was played; more than those of `games`, where these are a
+    reduction."""
     played: str
-    """What was played, in words."""
+    """The episodes that were played, in words."""
     mean: PayoffTable = field(repr=False)
-    """What replicas pay on average."""
+    """The game of the mean payoffs over replicas."""
     resamples: int
-    """Of the bootstrap; 0 for a single replica."""
+    """The number of resamples of the bootstrap; 0 for a single replica."""
     rank: AlphaRank = field(repr=False)
     shares: tuple[Estimate, ...]
-    """The share of the agents that play as each run in the long run of alpha-rank, with its interval."""
+    """For each run, the share of agents that play as it in the long run of alpha-rank, with its interval."""
     pure: dict[tuple[int, ...], float] = field(repr=False)
-    """The compositions in which no agent gains by playing as another run, by the number of agents of each
-    run, with the share of the resamples that have it too; NaN for a single replica."""
+    """The pure equilibria: compositions in which no agent gains by playing as another run. The values are the
+    shares of resamples that have the equilibrium too; NaN for a single replica."""
     equilibria: tuple[Equilibrium, ...]
-    """By nashpy, of a game of two agents, of a larger one of its reduction; empty for more than 6 runs."""
+    """The Nash equilibria by nashpy; those of the reduction for more than two agents; empty for more than 6
+    runs."""
     in_support: Float64 = field(repr=False)
-    """float64 [S]: the share of the resamples in which a run is played in a symmetric equilibrium of two
-    agents; NaN for a single replica, more than 6 runs, and for a game of more agents."""
+    """float64 [S]: for each run, the share of resamples with a symmetric equilibrium that plays it. NaN for a
+    single replica, for more than 6 runs, and for more than two agents."""
     ends: Ends = field(repr=False)
-    """Where replicator dynamics end."""
+    """The ends of replicator dynamics."""
 
     @property
     def pairs(self) -> Float64:
-        """What an agent of a run gets where all others play as another, float64 [R, S, S]."""
+        """Return the return of an agent that plays as one run while all others play as another, float64
+        [R, S, S]."""
         return np.array([game.pairs for game in self.games])
 
     @property
     def is_reduction(self) -> bool:
-        return self.of_agents > self.mean.agents
+        """Return whether the analysed game is a pairwise reduction of the game that was played."""
+        return self.played_agents > self.mean.agents
 
 
 @working("analysing the game")
@@ -205,35 +223,40 @@ def analyse(table: pa.Table, *, resamples: int = EGTA_RESAMPLES, seed: int = 0) 
     """
     names, games = games_in(table)
     analysis = analyse_games(names, games, resamples=resamples, seed=seed)
-    return replace(analysis, of_agents=_agents_in(table), played=said(table, "fresh") + _EACH)
+    return replace(analysis, played_agents=_agents_in(table), played=table_note(table, "fresh") + _EACH)
 
 
 def analyse_games(
     names: Sequence[str], games: Sequence[PayoffTable], *, resamples: int = EGTA_RESAMPLES, seed: int = 0
 ) -> Analysis:
-    """Analyse the game that replicas measured, see `analyse`."""
+    """Analyse the games that replicas measured; see `analyse`."""
     resamples = checked("resamples", resamples, Annotated[int, Range(1, 100_000)])
     replicas = len(games)
-    mean = mean_of(games)
+    mean = mean_game(games)
     rng = np.random.default_rng(seed)
-    drawn = rng.integers(replicas, size=(resamples if replicas > 1 else 0, replicas))
-    # Few replicas have few resamples that differ: each is analysed once.
-    times = Counter(tuple(sorted(places)) for places in drawn.tolist())
-    again = [mean_of([games[place] for place in places]) for places in times]
+    resampled = rng.integers(replicas, size=(resamples if replicas > 1 else 0, replicas))
+    # Few replicas have few resamples that differ: each is analysed once, and weighted by how often it came.
+    multiplicity = Counter(tuple(sorted(indices)) for indices in resampled.tolist())
+    resampled_games = []
+    for indices in multiplicity:
+        resampled_games.append(mean_game([games[index] for index in indices]))
     rank = alpha_rank(mean)
     is_small = mean.strategies <= MOST_STRATEGIES
+    nash_equilibria = equilibria(mean.reduced) if is_small else ()
     bounds = np.full((2, mean.strategies), np.nan)
     pure = dict.fromkeys(mean.pure_equilibria, nan)
     in_support = np.full(mean.strategies, nan)
-    if again:
-        counts = list(times.values())
-        weights = np.array(counts) / len(drawn)
-        ranks = np.repeat([alpha_rank(resample).shares for resample in again], counts, axis=0)
+    if resampled_games:
+        counts = list(multiplicity.values())
+        weights = np.array(counts) / len(resampled)
+        ranks = np.repeat([alpha_rank(game).shares for game in resampled_games], counts, axis=0)
         margin = (1 - CONFIDENCE) / 2
         bounds = np.quantile(ranks, [margin, 1 - margin], axis=0)
-        pure = {counts: float(weights @ [counts in one.pure_equilibria for one in again]) for counts in pure}
+        for composition in pure:
+            is_pure = [composition in game.pure_equilibria for game in resampled_games]
+            pure[composition] = float(weights @ is_pure)
         if mean.agents == 2 and is_small:
-            in_support = weights @ np.array([_is_played(resample) for resample in again], float)
+            in_support = weights @ np.array([_is_played(game) for game in resampled_games], float)
     shares = (
         Estimate(value=float(share), low=float(low), high=float(high), replicas=replicas)
         for share, low, high in zip(rank.shares, *bounds, strict=True)
@@ -241,14 +264,14 @@ def analyse_games(
     return Analysis(
         names=names,
         games=games,
-        of_agents=mean.agents,
+        played_agents=mean.agents,
         played="",
         mean=mean,
-        resamples=len(drawn),
+        resamples=len(resampled),
         rank=rank,
         shares=tuple(shares),
         pure=pure,
-        equilibria=equilibria(mean.reduced) if is_small else (),
+        equilibria=nash_equilibria,
         in_support=in_support,
         ends=replicator_ends(mean, seed=seed),
     )
@@ -262,11 +285,11 @@ def _is_played(game: PayoffTable) -> list[bool]:
 
 
 _LEAST: Final = 0.005
-"""Smaller shares are not listed."""
+"""The smallest share that is listed."""
 
 
-def egta_cells(analysis: Analysis) -> Iterator[Cells]:
-    """Yield the payoffs, the runs by alpha-rank, the equilibria, and where replicator dynamics end."""
+def egta_tables(analysis: Analysis) -> Iterator[TextTable]:
+    """Yield tables of the payoffs, of the runs' shares by alpha-rank, and of equilibria and dynamics."""
     yield _payoff_cells(analysis)
     title = "alpha-rank at the limit of infinite alpha: share of the agents in the long run"
     if analysis.resamples:
@@ -280,12 +303,12 @@ def egta_cells(analysis: Analysis) -> Iterator[Cells]:
         head.append("resamples in which a symmetric equilibrium plays it")
         for row, certain in zip(rows, analysis.in_support, strict=True):
             row.append(f"{certain:.0%}")
-    yield Cells(title, head, rows)
-    yield Cells("equilibria", ["", "what is played", "how certain"], list(_ends(analysis)), texts=2)
+    yield TextTable(title, head, rows)
+    yield TextTable("equilibria", ["", "what is played", "how certain"], list(_ends(analysis)), texts=2)
 
 
-def _payoff_cells(analysis: Analysis) -> Cells:
-    """Return payoffs by the runs of both of two agents, else by how many agents play as each."""
+def _payoff_cells(analysis: Analysis) -> TextTable:
+    """Return the table of payoffs: by the runs of two agents, or by compositions of more agents."""
     names = analysis.names
     agents = analysis.mean.agents
     if agents == 2:
@@ -294,33 +317,34 @@ def _payoff_cells(analysis: Analysis) -> Cells:
             for row, name in enumerate(names)
             for column, other in enumerate(names)
         }
-        others = f"all other {analysis.of_agents - 1}" if analysis.is_reduction else "the other"
+        others = f"all other {analysis.played_agents - 1}" if analysis.is_reduction else "the other"
         title = f"return of an agent, by its run and the run of {others}"
-        return matrix_cells(Family(levels, ("an agent", "others")), "return", title)
+        return matrix_table(Family(levels, ("an agent", "others")), "return", title)
     rows = []
     for place, counts in enumerate(compositions(agents, len(names)).tolist()):
         row: list[Any] = [composition_text(counts, names)]
         for run, count in enumerate(counts):
             payoffs = [game.payoffs[place, run] for game in analysis.games]
-            row.append(estimate(payoffs) if count else "")
+            cell = estimate(payoffs) if count else ""
+            row.append(cell)
         rows.append(row)
     title = "return of an agent of each run, by how many agents play as each"
-    return Cells(title, ["agents", *names], rows)
+    return TextTable(title, ["agents", *names], rows)
 
 
 def _ends(analysis: Analysis) -> Iterator[tuple[str, str, str]]:
-    """Yield what no agent leaves alone, the Nash equilibria, and where the dynamics end."""
+    """Yield rows for pure equilibria, Nash equilibria, and ends of the replicator dynamics."""
     names = analysis.names
     for counts, certain in analysis.pure.items():
         resamples = "" if isnan(certain) else f"in {certain:.0%} of the resamples"
         yield "no agent gains by another run", composition_text(counts, names), resamples
     if not analysis.pure:
         yield "no agent gains by another run", "no composition", ""
-    of_pairs = "" if analysis.mean.agents == 2 else " of pairs"
+    which = "" if analysis.mean.agents == 2 else " of pairs"
     for equilibrium in analysis.equilibria:
         both = [mixture_text(side, names) for side in (equilibrium.first, equilibrium.second)]
         played = both[0] if equilibrium.is_symmetric else " against ".join(both)
-        yield f"Nash equilibrium{of_pairs} (nashpy)", played, ""
+        yield f"Nash equilibrium{which} (nashpy)", played, ""
     ends = [mixture_text(mixture, names) for mixture in analysis.ends.mixtures]
     shares = [*analysis.ends.shares, analysis.ends.unsettled]
     for end, share in zip([*ends, "none, or a late one"], shares, strict=True):
@@ -340,13 +364,17 @@ def mixture_text(mixture: Float64, names: Sequence[str]) -> str:
 
 
 _POINTS: Final = 41
+"""Points of the line that shows the dynamics of two runs."""
 _GRID: Final = 14
+"""Steps of the grid of arrows along an edge of the triangle that shows the dynamics of three runs."""
 _CORNERS: Final = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, 3**0.5 / 2]])
+"""The corners (x, y) of that triangle: all agents play as run 0, 1, 2."""
 _DYNAMICS_HIGH: Final = 22.0
+"""The height of the panel with the dynamics, in em."""
 
 
 def gains_by_switching(analysis: Analysis) -> Family:
-    """Return what one agent gains that plays as another run than all others: by its run and theirs."""
+    """Return the gain of an agent that plays as another run than all others, by its run and theirs."""
     names = analysis.names
     pairs = analysis.pairs
     gains = {
@@ -355,20 +383,23 @@ def gains_by_switching(analysis: Analysis) -> Family:
         )
         for played, others in permutations(range(len(names)), 2)
     }
-    return judged(gains, ("an agent", "others"))
+    return judge_family(gains, ("an agent", "others"))
 
 
 def draw_egta(analysis: Analysis, path: Path | str, *, width: style.Width = "page") -> Path:
-    """Draw what one agent gains that plays as another run than all others, with a star where it is not 0 by
-    Holm's method; each run's share by alpha-rank, with the most frequent end of replicator dynamics; and the
-    phase portrait of these dynamics where there are two or three runs."""
+    """Draw an analysis in two or three panels.
+
+    They show the gain of an agent that switches to another run, with a star if it is significant by Holm's
+    method; each run's share by alpha-rank; and, for two or three runs, the phase portrait of the replicator
+    dynamics.
+    """
     names = {name: name for name in analysis.names}
     gains = gains_by_switching(analysis)
     texts = {key[:2]: f"{gain.value:+.3g}" + " *" * gain.differs for key, gain in gains.items()}
     at_home = np.diagonal(analysis.pairs, axis1=1, axis2=2).mean(0)
     texts |= {(name, name): f"{mean:.3g}" for name, mean in zip(names, at_home, strict=True)}
     draw_dynamics = {2: _draw_line, 3: _draw_simplex}.get(len(names))
-    with style.drawing(path, width=width, colours=style.SHADES, is_new=True) as sheet:
+    with style.drawing(path, width=width, colours=style.PNG_SHADES, is_new=True) as sheet:
         columns = sheet.fitting(2, 24)
         ratios: Any = {"width_ratios": (1.35, 1)} if columns == 2 else {}
         heights = [matrix_height(len(names))] * (3 - columns) + [_DYNAMICS_HIGH] * bool(draw_dynamics)
@@ -381,12 +412,12 @@ def draw_egta(analysis: Analysis, path: Path | str, *, width: style.Width = "pag
         matrix.set(xlabel="run of all others", ylabel="run of an agent")
         matrix.set_title("gain of an agent by another run")
         _draw_ranks(rank, analysis)
-        kind = f"{analysis.of_agents} agents"
+        kind = f"{analysis.played_agents} agents"
         if analysis.is_reduction:
             kind = f"pairwise reduction of {kind}"
         sheet.title = f"Empirical game of {', '.join(names)}"
         sheet.caption = (
-            f"{kind}; {analysis.played}. {HOLM} for these {len(gains)}; diagonal: an agent's return; "
+            f"{kind}; {analysis.played}. {HOLM_NOTE} for these {len(gains)}; diagonal: an agent's return; "
             f"intervals of shares: 95 % of {analysis.resamples} resamples of the replicas."
         )
     return Path(path)
@@ -408,10 +439,12 @@ def _draw_ranks(axes: Axes, analysis: Analysis) -> None:
 
 
 def _draw_line(axes: Axes, analysis: Analysis) -> None:
-    """Draw what the first of two runs gains over the second, by its share, with the fixed points."""
+    """Draw the advantage of the first of two runs by its share of the population, with the fixed points."""
     first, second = analysis.names
     shares = np.linspace(0, 1, _POINTS)
-    curves = [[np.subtract(*game.against([share, 1 - share])) for share in shares] for game in analysis.games]
+    curves = []
+    for game in analysis.games:
+        curves.append([np.subtract(*game.against([share, 1 - share])) for share in shares])
     middle, low, high = curve_interval(curves)
     draw_line(axes, shares, (middle, low, high))
     axes.axhline(0, color=style.RAW, lw=1, zorder=1)
@@ -429,7 +462,7 @@ def _draw_line(axes: Axes, analysis: Analysis) -> None:
 
 
 def _fixed_points(shares: Float64, gains: Float64) -> list[tuple[float, bool]]:
-    """Return where nothing changes, and whether shares nearby move there."""
+    """Return the fixed points of the dynamics of two runs, each with whether it is stable."""
     points = [(0.0, bool(gains[0] < 0)), (1.0, bool(gains[-1] > 0))]
     for place in np.flatnonzero(gains[:-1] * gains[1:] < 0):
         low, high = gains[place : place + 2]
@@ -439,7 +472,7 @@ def _fixed_points(shares: Float64, gains: Float64) -> list[tuple[float, bool]]:
 
 
 def _draw_simplex(axes: Axes, analysis: Analysis) -> None:
-    """Draw the direction in which the shares of three runs move, where they end, and the corners by name."""
+    """Draw the dynamics of the shares of three runs in a triangle, with their ends."""
     axes.plot(*np.vstack([_CORNERS, _CORNERS[:1]]).T, color=style.RAW, lw=1)
     mixtures = (compositions(_GRID - 3, 3) + 1) / _GRID
     moves = np.array([replicator(analysis.mean.normalised, mixture) for mixture in mixtures]) @ _CORNERS

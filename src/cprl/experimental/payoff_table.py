@@ -20,19 +20,18 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cprl.values import Range, checked, refusal
-from cprl.values.arrays import Float64, Int64
+from cprl.values.array_types import Float64, Int64
 
 MOST_COMPOSITIONS: Final = 100_000
 _SUM: Final = 1e-6
-"""By how much the shares of a mixture may miss 1."""
+"""The difference from 1 that the shares of a mixture may have together."""
 _ROUNDING: Final = 1e-9
-"""Of payoffs, as a share of their range."""
+"""The rounding of payoffs, as a share of their range."""
 
 
 def compositions(agents: int, strategies: int) -> Int64:
-    """How many of N agents play each of S strategies, int64 [C, S], every way once; the first row has all of
-    them play strategy 0, the last one the last strategy.
-    """
+    """Return how many of N agents play each of S strategies, int64 [C, S], every way once; the first row has
+    all of them play strategy 0, the last one the last strategy."""
     rows = comb(agents + strategies - 1, agents)
     if rows > MOST_COMPOSITIONS:
         raise ValueError(
@@ -57,73 +56,77 @@ class PayoffTable:
 
     def __post_init__(self) -> None:
         agents = checked("agents", self.agents, Annotated[int, Range(2, 1000)])
-        given = np.asarray(self.payoffs, np.float64)
-        strategies = given.shape[1] if given.ndim == 2 else 0
+        payoffs = np.asarray(self.payoffs, np.float64)
+        strategies = payoffs.shape[1] if payoffs.ndim == 2 else 0
         rows = comb(agents + strategies - 1, agents) if strategies > 1 else 0
-        if given.ndim != 2 or strategies < 2 or len(given) != rows:
-            wanted = f"[{rows}, {strategies}]" if rows else "[C, S], of 2 or more strategies"
-            raise ValueError(f"payoffs is {list(given.shape)}; allowed with {agents} agents: {wanted}")
+        if strategies < 2 or len(payoffs) != rows:
+            allowed = f"[{rows}, {strategies}]" if rows else "[C, S], of 2 or more strategies"
+            raise ValueError(f"payoffs is {list(payoffs.shape)}; allowed with {agents} agents: {allowed}")
         counts = compositions(agents, strategies)
-        payoffs = np.where(counts > 0, given, np.nan)
+        payoffs = np.where(counts > 0, payoffs, np.nan)
         if not np.isfinite(payoffs[counts > 0]).all():
             raise ValueError("payoffs has NaN or infinity where agents play; allowed: finite numbers")
         object.__setattr__(self, "agents", agents)
         object.__setattr__(self, "payoffs", payoffs)
 
     @classmethod
-    def of_pairs(cls, matrix: ArrayLike) -> Self:
-        """The game of two agents: entry [i, j] is what one gets who plays i, where the other plays j."""
-        given = np.asarray(matrix, np.float64)
-        if given.ndim != 2 or given.shape[0] != given.shape[1] or len(given) < 2:
-            raise ValueError(f"matrix is {list(given.shape)}; allowed: [S, S], of 2 or more strategies")
-        counts = compositions(2, len(given))
-        other = counts[:, None, :] - np.eye(len(given), dtype=np.int64)  # [C, own strategy, the other's]
-        return cls(agents=2, payoffs=(other * given).sum(-1))
+    def from_pairs(cls, matrix: ArrayLike) -> Self:
+        """Return the game of two agents: entry [i, j] is what one gets who plays i, where the other plays
+        j."""
+        payoffs = np.asarray(matrix, np.float64)
+        if payoffs.ndim != 2 or payoffs.shape[0] != payoffs.shape[1] or len(payoffs) < 2:
+            raise ValueError(f"matrix is {list(payoffs.shape)}; allowed: [S, S], of 2 or more strategies")
+        counts = compositions(2, len(payoffs))
+        other = counts[:, None, :] - np.eye(len(payoffs), dtype=np.int64)  # [C, own strategy, the other's]
+        return cls(agents=2, payoffs=(other * payoffs).sum(-1))
 
     @property
     def strategies(self) -> int:
-        """The number of strategies S."""
+        """Return the number of strategies S."""
         return int(self.payoffs.shape[1])
 
     @cached_property
     def counts(self) -> Int64:
-        """int64 [C, S]: how many agents play each strategy."""
+        """Return how many agents play each strategy, int64 [C, S]."""
         return compositions(self.agents, self.strategies)
 
     @cached_property
     def rows(self) -> dict[tuple[int, ...], int]:
-        """The rows by their counts."""
+        """Return the number of each row by its counts."""
         return {tuple(counts): row for row, counts in enumerate(self.counts.tolist())}
 
     @cached_property
     def deviations(self) -> Float64:
-        """float64 [C', S]: what an agent gets who plays a strategy, by how many of the other N - 1 play each,
-        in the rows of `compositions(N - 1, S)`."""
-        rows = [[self.rows[counts] for counts in self._with_one_more(others)] for others in self._others[0]]
+        """Return what an agent gets who plays a strategy, float64 [C', S], by how many of the other N - 1
+        play each, in the rows of `compositions(N - 1, S)`."""
+        rows = []
+        for others in self._others[0]:
+            rows.append([self.rows[counts] for counts in self._with_one_more(others)])
         values: Float64 = self.payoffs[rows, np.arange(self.strategies)]
         return values
 
     @cached_property
     def pairs(self) -> Float64:
-        """float64 [S, S]: entry [i, j] is what one agent gets who plays i, where all others play j."""
+        """Return what one agent gets who plays i, where all others play j, float64 [S, S]."""
         others, _ = self._others
         alike = [int(others[:, strategy].argmax()) for strategy in range(self.strategies)]
         return self.deviations[alike].T.copy()
 
     @property
     def reduced(self) -> "PayoffTable":
-        """The game of two agents with the payoffs of `pairs`, a reduction unless N is 2: it says what the
-        first agent gains who deviates from what all others play, and nothing of other compositions."""
-        return self.of_pairs(self.pairs)
+        """Return the game of two agents with the payoffs of `pairs`, a reduction unless N is 2: it says what
+        the first agent gains who deviates from what all others play, and nothing of other compositions."""
+        return self.from_pairs(self.pairs)
 
     @cached_property
     def normalised(self) -> "PayoffTable":
-        """The same game with payoffs from 0 to 1; all 0 where they are all the same."""
-        low, high = float(np.nanmin(self.payoffs)), float(np.nanmax(self.payoffs))
-        return PayoffTable(agents=self.agents, payoffs=(self.payoffs - low) / ((high - low) or 1.0))
+        """Return the same game with payoffs from 0 to 1; all 0 where they are all the same."""
+        low = float(np.nanmin(self.payoffs))
+        range_of_payoffs = float(np.nanmax(self.payoffs)) - low
+        return PayoffTable(agents=self.agents, payoffs=(self.payoffs - low) / (range_of_payoffs or 1.0))
 
     def against(self, mixture: ArrayLike) -> Float64:
-        """What an agent gets by its strategy, float64 [S], if each of the others plays one by chance.
+        """Return what an agent gets by its strategy, float64 [S], if each of the others plays one by chance.
 
         It is the mean over what the N - 1 others play, so it is also defined for strategies that nobody
         plays. (OpenSpiel's `expected_payoff` of a heuristic payoff table is another number: the mean over
@@ -132,22 +135,22 @@ class PayoffTable:
         return self.against_shares(mixture_of(mixture, self.strategies))
 
     def against_shares(self, shares: Float64) -> Float64:
-        """`against`, of float64 [S] that is known to be shares."""
+        """Return what `against` does, of float64 [S] that is known to be shares."""
         others, ways = self._others
         values: Float64 = (ways * np.prod(shares**others, axis=1)) @ self.deviations
         return values
 
     @cached_property
     def _others(self) -> tuple[Int64, Float64]:
-        """What the N - 1 others may play, and in how many ways, [C', S] and [C']."""
+        """Return what the N - 1 others may play, and in how many ways, [C', S] and [C']."""
         others = compositions(self.agents - 1, self.strategies)
         ways = [factorial(self.agents - 1) // prod(map(factorial, counts)) for counts in others.tolist()]
         return others, np.array(ways, np.float64)
 
     @property
     def pure_equilibria(self) -> list[tuple[int, ...]]:
-        """The counts of the compositions in which no agent gains if it alone plays another strategy, but for
-        rounding."""
+        """Return the counts of the compositions in which no agent gains if it alone plays another strategy,
+        but for rounding."""
         most = _ROUNDING * float(np.nanmax(self.payoffs) - np.nanmin(self.payoffs))
         left = {
             counts
@@ -158,12 +161,12 @@ class PayoffTable:
         return [counts for counts in self.rows if counts not in left]
 
     def _with_one_more(self, others: Int64) -> list[tuple[int, ...]]:
-        """The counts if one more agent plays each strategy in turn."""
+        """Return the counts if one more agent plays each strategy in turn."""
         return list(map(tuple, (others + np.eye(self.strategies, dtype=np.int64)).tolist()))
 
 
 def mixture_of(mixture: ArrayLike, strategies: int) -> Float64:
-    """Shares of strategies, float64 [S], that sum to 1."""
+    """Return a mixture as shares of strategies, float64 [S], that sum to 1; refuse any other."""
     shares = np.asarray(mixture, np.float64)
     is_mixture = shares.shape == (strategies,) and (shares >= 0).all() and abs(shares.sum() - 1) < _SUM
     if not is_mixture:

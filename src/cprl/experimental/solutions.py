@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from cprl.experimental.payoff_table import PayoffTable, mixture_of
-from cprl.values.arrays import Float64
+from cprl.values.array_types import Float64
 
 _PACKAGES: Final = {"open_spiel": "alpha-rank and replicator dynamics", "nashpy": "equilibria"}
 MOST_STRATEGIES: Final = 6
@@ -34,14 +34,14 @@ _SAME: Final = 1e-6
 """Shares that differ by less are the same."""
 MOST_PROFILES: Final = 256
 """S^N, e.g. 4 agents with 4 strategies; with more, OpenSpiel takes seconds."""
-STARTS: Final = 40
+REPLICATOR_STARTS: Final = 40
 
 _NOISES: Final = (1e-6, 1e-5, 1e-4, 1e-3)
 _STEPS: Final = 1500
-"""Of the integration, whose steps are the longer the slower the shares change."""
+"""The number of steps of the integration, which are the longer the slower the shares change."""
 _AT_REST: Final = 1e-6
 _NO_GAIN: Final = 1e-5
-"""By how much a strategy may get more than the mean at rest, as a share of the range of the payoffs."""
+"""The excess of a strategy over the mean at rest, as a share of the range of the payoffs."""
 _SAME_END: Final = 0.01
 
 
@@ -56,17 +56,17 @@ class Equilibrium:
 
     @property
     def is_symmetric(self) -> bool:
-        """Whether both play the same."""
+        """Return whether both play the same."""
         return bool(np.allclose(self.first, self.second, atol=_SAME))
 
     @property
     def support(self) -> tuple[int, ...]:
-        """The strategies that an agent plays, ascending."""
+        """Return the strategies that an agent plays, ascending."""
         return tuple(np.flatnonzero((self.first > _SAME) | (self.second > _SAME)).tolist())
 
 
 def equilibria(table: PayoffTable) -> tuple[Equilibrium, ...]:
-    """The equilibria of a symmetric game of two agents, by nashpy's enumeration of vertices.
+    """Return the equilibria of a symmetric game of two agents, by nashpy's enumeration of vertices.
 
     They are all of them, unless the game is degenerate: where strategies are equally good, there may be
     infinitely many, and these are the corners. An equilibrium in which the agents play differently is there
@@ -100,7 +100,7 @@ class AlphaRank:
 
 
 def alpha_rank(table: PayoffTable) -> AlphaRank:
-    """Alpha-rank of a symmetric game in the limit of infinite alpha, by OpenSpiel.
+    """Return alpha-rank of a symmetric game in the limit of infinite alpha, by OpenSpiel.
 
     Payoffs are first scaled to 0..1. A mutant takes over if it gets more, with probability 1/2 if it gets the
     same (to 1e-5 of what it gets), and else almost never; "almost" is 1e-6, or the next power of ten with
@@ -115,17 +115,17 @@ def alpha_rank(table: PayoffTable) -> AlphaRank:
             f"table has {table.strategies}^{table.agents} = {profiles:,} profiles; allowed: at most "
             f"{MOST_PROFILES}, e.g. table.reduced"
         )
-    of_profiles = _long_run(table)
+    shares = _long_run(table)
     played = np.array(np.unravel_index(np.arange(profiles), (table.strategies,) * table.agents)).T
     frequencies = np.zeros(len(table.counts))
-    for profile, chance in zip(played, of_profiles, strict=True):
+    for profile, share in zip(played, shares, strict=True):
         counts = np.bincount(profile, minlength=table.strategies)
-        frequencies[table.rows[tuple(counts.tolist())]] += chance
+        frequencies[table.rows[tuple(counts.tolist())]] += share
     return AlphaRank(compositions=frequencies, shares=frequencies @ table.counts / table.agents)
 
 
 def _long_run(table: PayoffTable) -> Float64:
-    """The share of each profile of N agents, [S^N], the last agent's strategy changing fastest."""
+    """Return the share of each profile of N agents, [S^N], the last agent's strategy changing fastest."""
     rank = extra("open_spiel.python.egt.alpharank")
     tables = [_heuristic(table.normalised)] * table.agents
     for noise in _NOISES:
@@ -143,15 +143,16 @@ def _shares(measured: Any) -> Float64:
 
 
 def _heuristic(table: PayoffTable) -> Any:
-    """The table as OpenSpiel has it, 0 where nobody plays."""
-    made = extra("open_spiel.python.egt.heuristic_payoff_table").PayoffTable(table.agents, table.strategies)
+    """Return the table as OpenSpiel has it, 0 where nobody plays."""
+    module = extra("open_spiel.python.egt.heuristic_payoff_table")
+    heuristic = module.PayoffTable(table.agents, table.strategies)
     for counts, payoffs in zip(table.counts.tolist(), np.nan_to_num(table.payoffs), strict=True):
-        made[tuple(counts)] = payoffs
-    return made
+        heuristic[tuple(counts)] = payoffs
+    return heuristic
 
 
 def replicator(table: PayoffTable, mixture: ArrayLike) -> Float64:
-    """How fast the shares of the strategies change, float64 [S], which sums to 0: by OpenSpiel.
+    """Return how fast the shares of the strategies change, float64 [S], which sums to 0: by OpenSpiel.
 
     Args:
         mixture: the shares, float [S], that sum to 1.
@@ -163,18 +164,18 @@ def replicator(table: PayoffTable, mixture: ArrayLike) -> Float64:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Ends:
-    """Where replicator dynamics end."""
+    """The ends of replicator dynamics."""
 
     mixtures: Float64
-    """float64 [K, S], the points of rest that were reached, the most frequent first."""
+    """float64 [K, S], the fixed points that were reached, the most frequent first."""
     shares: Float64
     """float64 [K], of the starts that end there."""
     unsettled: float
     """The share of the starts that go on for ever, or for very long."""
 
 
-def replicator_ends(table: PayoffTable, *, starts: int = STARTS, seed: int = 0) -> Ends:
-    """Where replicator dynamics end that start anywhere, with all shares above 0.
+def replicator_ends(table: PayoffTable, *, starts: int = REPLICATOR_STARTS, seed: int = 0) -> Ends:
+    """Return the ends of replicator dynamics that start anywhere, with all shares above 0.
 
     Args:
         starts: so many mixtures, drawn uniformly.
@@ -198,13 +199,14 @@ def replicator_ends(table: PayoffTable, *, starts: int = STARTS, seed: int = 0) 
 
 
 def _end(table: PayoffTable, start: Float64) -> Float64 | None:
-    """Where the dynamics end, or None if they are not at rest after a long time.
+    """Return the end of the dynamics, or None if they are not at rest after a long time.
 
     Shares hardly change where a strategy that gets more is rare, too; that is no rest.
     """
     from scipy import integrate
 
-    scaled, flow = table.normalised, extra("open_spiel.python.egt.dynamics").replicator
+    scaled = table.normalised
+    flow = extra("open_spiel.python.egt.dynamics").replicator
 
     def speed(_: float, cells: Float64) -> Float64:
         shares = _shares(cells)
@@ -227,13 +229,13 @@ def _end(table: PayoffTable, start: Float64) -> Float64 | None:
 
 
 def check_extras() -> None:
-    """Raises a ModuleNotFoundError, which says how to install it, if OpenSpiel or nashpy is missing."""
+    """Raise a ModuleNotFoundError, which says how to install it, if OpenSpiel or nashpy is missing."""
     for package in _PACKAGES:
         extra(package)
 
 
 def extra(module: str) -> Any:
-    """A module of OpenSpiel or nashpy."""
+    """Import and return a module of OpenSpiel or nashpy."""
     package = module.partition(".")[0]
     if find_spec(package) is None:
         raise ModuleNotFoundError(

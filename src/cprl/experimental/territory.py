@@ -1,4 +1,7 @@
-"""territory_of: where the agents of a stored run go in fresh worlds and whom they tag, beside random play."""
+"""territory_of: measure whether the agents of a stored run keep to places of their own, and whom they tag.
+
+The agents play fresh worlds, and random agents play the same worlds for comparison.
+"""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,73 +10,78 @@ from typing import Any, Final, Literal
 import numpy as np
 import pyarrow as pa
 from matplotlib.axes import Axes
+from numpy.typing import NDArray
 
 from cprl.commons.cells import APPLE, GROUND, WALL
 from cprl.commons.maps import Map
-from cprl.evaluation.evaluate import opened
-from cprl.evaluation.lanes import (
+from cprl.evaluation.evaluate import as_loaded
+from cprl.evaluation.pages import heading
+from cprl.evaluation.populations import (
     agents_of,
     commons_game,
     fresh_for,
+    fresh_worlds,
+    join_tables,
     policies_of,
-    said,
-    scripted,
-    together,
-    worlds_of,
+    scripted_agent,
+    table_note,
 )
-from cprl.evaluation.pages import heading
 from cprl.experimental import movement
-from cprl.experimental.movement import Array, Trace, overlap, owners, trace, visits
+from cprl.experimental.movement import Trace, overlap, owners, trace, visit_shares
 from cprl.measuring.statistics import estimates
 from cprl.measuring.table import labelled, where
 from cprl.pictures.colours import PALETTE, agent_colour
 from cprl.system.defaults import Fresh
 from cprl.system.working import working
 from cprl.terminal import style
-from cprl.terminal.tables import Cells
+from cprl.terminal.text_tables import TextTable
 from cprl.training.stored import LoadedRun
 from cprl.values import checked, refusal
+from cprl.values.array_types import Float64
 
-Policy = Literal["trained", "random"]
+PlayedPolicy = Literal["trained", "random"]
 
-WORDS: Final[Mapping[str, str]] = {
+TERRITORY_NUMBERS: Final[Mapping[str, str]] = {
     "exclusion": "exclusion (0 to 1)",
     "visitors": "agents that share a cell",
     "overlap": "overlap of two agents within an episode (0 to 1)",
     "tag_rate": "tags per 1000 steps",
     "defence": "tags in one's own territory (0 to 1)",
 }
-"""What the numbers of a table of territory are called: exclusion, visitors and defence of the visits of all
-episodes of a replica, overlap the mean over episodes; NaN where undefined."""
-ARRAYS: Final = ("visits", "tags_by_agent", "tags_by_cell")
-"""Its arrays of each agent, as lists: float64 [H x W], the share of its time in each cell, mean over
-episodes; int64 [N], how often it was tagged by each, and [H x W], in each cell, in all episodes."""
+"""The numbers of a table of territory, with what they are called: exclusion, visitors and defence of the
+visits of all episodes of a replica, overlap the mean over episodes; NaN where undefined."""
+ARRAY_COLUMNS: Final = {
+    "visits": "float64 [H x W], the share of its time that the agent spent in each cell, mean over episodes",
+    "tags_by_agent": "int64 [N], how often each agent tagged it, in all episodes",
+    "tags_by_cell": "int64 [H x W], how often it was tagged in each cell, in all episodes",
+}
+"""The columns of a table of territory that hold a list for each agent, and what they hold."""
 
 
 @working("evaluating")
 def territory_of(run: str | Path | LoadedRun, fresh: Fresh = Fresh()) -> pa.Table:
-    """Let every replica of a stored run play fresh episodes, and random agents in the same worlds.
+    """Play fresh episodes with all replicas of a run, and with random agents in the same worlds.
 
     The episodes are those of `cprl.evaluate_run` with the same arguments.
 
     Returns:
         A row for each policy, replica and agent, by "policy": "trained" or "random"; with the numbers of
-        `WORDS` and `ARRAYS`, see `maps_of`.
+        `TERRITORY_NUMBERS` and `ARRAY_COLUMNS`, see `maps_of`.
     """
-    loaded = opened(run)
+    loaded = as_loaded(run)
     commons_game(loaded)
     fresh = fresh_for([loaded], fresh)
-    policies = {"trained": agents_of(loaded), "random": [scripted("random")] * loaded.game.agents}
+    policies = {"trained": agents_of(loaded), "random": [scripted_agent("random")] * loaded.game.agents}
     parts: list[pa.Table] = []
     for policy, agents in policies.items():
-        for group, env in worlds_of(fresh, loaded):
+        for group, env in fresh_worlds(fresh, loaded):
             played = trace(env, policies_of(fresh, loaded, agents, group), explore=not fresh.greedy)
             for place, replica in enumerate(group):
                 first = place * fresh.episodes
-                rows = _of_replica(played.worlds(first, first + fresh.episodes))
+                rows = _columns_of_replica(played.worlds(first, first + fresh.episodes))
                 labels = {"policy": policy, "replica": replica}
                 parts.append(labelled(pa.table(rows), **labels))
-    return together(
+    return join_tables(
         parts,
         heading=heading(loaded.path.name, fresh, [loaded]),
         weights=loaded.weights_from,
@@ -82,9 +90,9 @@ def territory_of(run: str | Path | LoadedRun, fresh: Fresh = Fresh()) -> pa.Tabl
     )
 
 
-def _of_replica(played: Trace) -> dict[str, Any]:
-    """Return the columns of the worlds of one replica, an entry for each agent."""
-    shares = visits(played).mean(0)  # every agent is in play as an episode begins
+def _columns_of_replica(played: Trace) -> dict[str, Any]:
+    """Return the columns of a replica, with an entry for each agent."""
+    shares = visit_shares(played).mean(0)  # every agent is in play as an episode begins
     taggings = movement.taggings(played)
     tags = taggings.sum((1, 2))
     driven_out = np.where(tags > 0, movement.defence(played, shares), 0.0)
@@ -92,7 +100,7 @@ def _of_replica(played: Trace) -> dict[str, Any]:
         defence = (driven_out * tags).sum() / np.float64(tags.sum())
     numbers = {
         "exclusion": movement.exclusion(shares),
-        "visitors": movement.visitors(shares),
+        "visitors": movement.agents_per_cell(shares),
         "overlap": overlap(played).mean(),
         "tag_rate": 1000 * tags.sum() / played.played.sum(),
         "defence": defence,
@@ -102,36 +110,35 @@ def _of_replica(played: Trace) -> dict[str, Any]:
     return {
         "agent": list(range(agents)),
         **{name: np.full(agents, value) for name, value in numbers.items()},
-        **{name: list(array.reshape(agents, -1)) for name, array in zip(ARRAYS, arrays, strict=True)},
+        **{name: list(array.reshape(agents, -1)) for name, array in zip(ARRAY_COLUMNS, arrays, strict=True)},
     }
 
 
-def maps_of(table: pa.Table, name: str, policy: Policy = "trained") -> Array:
-    """Return one of `ARRAYS` of all replicas, [R, N, H x W] or [R, N, N]."""
-    rows = where(table, policy=checked("policy", policy, Policy)).sort_by("replica")
+def maps_of(table: pa.Table, name: str, policy: PlayedPolicy = "trained") -> NDArray[Any]:
+    """Return one of `ARRAY_COLUMNS` of all replicas, [R, N, H x W] or [R, N, N]."""
+    rows = where(table, policy=checked("policy", policy, PlayedPolicy)).sort_by("replica")
     arrays = np.array(rows[name].to_pylist())
     return arrays.reshape(len(rows["replica"].unique()), -1, arrays.shape[-1])
 
 
-def number_of(table: pa.Table, name: str, policy: Policy = "trained") -> Array:
-    """Return one of the numbers of `WORDS` of all replicas, float64 [R]."""
-    rows = where(table, policy=checked("policy", policy, Policy), agent=0).sort_by("replica")
+def number_of(table: pa.Table, name: str, policy: PlayedPolicy = "trained") -> Float64:
+    """Return one of the numbers of `TERRITORY_NUMBERS` of all replicas, float64 [R]."""
+    rows = where(table, policy=checked("policy", policy, PlayedPolicy), agent=0).sort_by("replica")
     return np.array(rows[name].to_pylist(), np.float64)
 
 
-def territory_cells(table: pa.Table) -> Cells:
-    """Return a row for each number: mean over replicas and 95 % interval, of the run's agents and of random
-    ones; a dash where it is undefined in all."""
-    means = estimates(table, list(WORDS), "policy")
+def territory_table(table: pa.Table) -> TextTable:
+    """Return a table of the numbers, for the run's agents and for random ones: means with 95 % intervals."""
+    means = estimates(table, list(TERRITORY_NUMBERS), "policy")
     rows = []
-    for name, words in WORDS.items():
-        of_policies = [means[policy, name] for policy in ("trained", "random")]
-        rows.append([words, *(one if one.replicas else "-" for one in of_policies)])
-    return Cells("where agents go, and whom they tag", ["", "run's agents", "random"], rows)
+    for name, text in TERRITORY_NUMBERS.items():
+        numbers = [means[policy, name] for policy in ("trained", "random")]
+        rows.append([text, *(number if number.replicas else "-" for number in numbers)])
+    return TextTable("where agents go, and whom they tag", ["", "run's agents", "random"], rows)
 
 
-COLUMNS: Final = 3
-"""Maps side by side."""
+_COLUMNS: Final = 3
+"""The largest number of maps side by side."""
 DARKEST: Final = 0.3
 """The brightness of a cell that was visited least; 1 is the cell with the longest stay."""
 
@@ -142,7 +149,7 @@ def draw_visits(
     path: str | Path,
     *,
     replica: int | None = None,
-    policy: Policy = "trained",
+    policy: PlayedPolicy = "trained",
     width: style.Width = "page",
 ) -> Path:
     """Draw who spends most time in each cell, and where each agent of a replica spends its time.
@@ -171,8 +178,8 @@ def draw_visits(
     hues = np.stack([_rgb(agent_colour(agent)) for agent in range(len(shares))])
     alone = np.divide(longest, total, out=np.zeros_like(total), where=total > 0)
     light = DARKEST + (1 - DARKEST) * np.sqrt(longest / max(longest.max(), 1e-12)) * alone
-    with style.drawing(path, width=width, colours=style.SHADES, is_new=True) as sheet:
-        columns = sheet.fitting(min(COLUMNS, len(shares) + 1), 16)
+    with style.drawing(path, width=width, colours=style.PNG_SHADES, is_new=True) as sheet:
+        columns = sheet.fitting(min(_COLUMNS, len(shares) + 1), 16)
         high = sheet.width_em / columns * board.height / board.width + 2
         whole, *panels = sheet.panels(len(shares) + 1, columns=columns, high=high)
         _show(whole, board, hues[owner], np.where(owner >= 0, light, 0.0), "who spends most time where")
@@ -190,14 +197,14 @@ def draw_visits(
         exclusion, sharing = (first[name][0].as_py() for name in ("exclusion", "visitors"))
         sheet.title = f"Where {'random ' * (policy == 'random')}agents spend their time"
         sheet.caption = (
-            f"{said(table, 'run')}, replica {number}, {said(table, 'episodes')} episodes; exclusion "
-            f"{exclusion:.2f}, {sharing:.1f} agents share a cell. The brighter, the longer; a ring is where "
-            "an agent starts, squares are sites of apples, grey cells walls."
+            f"{table_note(table, 'run')}, replica {number}, {table_note(table, 'episodes')} episodes; "
+            f"exclusion {exclusion:.2f}, {sharing:.1f} agents share a cell. The brighter, the longer; a ring "
+            "is where an agent starts, squares are sites of apples, grey cells walls."
         )
     return Path(path)
 
 
-def _show(panel: Axes, board: Map, hues: Array, light: Array, title: str) -> None:
+def _show(panel: Axes, board: Map, hues: Float64, light: Float64, title: str) -> None:
     """Show hues [H, W, 3] on the ground by their brightness [H, W], with the board's walls and sites."""
     image = _rgb(PALETTE[GROUND]) * (1 - light[..., None]) + hues * light[..., None]
     for cell in board.walls:
@@ -210,10 +217,10 @@ def _show(panel: Axes, board: Map, hues: Array, light: Array, title: str) -> Non
     panel.set_title(title)
 
 
-def _light(shares: Array, longest: float) -> Array:
+def _light(shares: Float64, longest: float) -> Float64:
     """Return the brightness of cells, 0..1, by the square root of the share of an agent's time."""
     return np.where(shares > 0, DARKEST + (1 - DARKEST) * np.sqrt(shares / max(longest, 1e-12)), 0.0)
 
 
-def _rgb(colour: tuple[int, int, int]) -> Array:
+def _rgb(colour: tuple[int, int, int]) -> Float64:
     return np.array(colour) / 255

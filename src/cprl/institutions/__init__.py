@@ -1,26 +1,33 @@
-"""Institutions: rules that people make, a module a kind, and their scalar rules.
+"""Institutions: rules that people make, such as quotas and taxes, on top of the rules of a game.
 
-Values: `Game(..., institutions=(Quota(share=0.8), Tax(rate=0.2)))`. A module has the value, `Arrays`, which
-are its parameters and what it remembers of B worlds, `parameters`, which fills them, and its rules, which act
-at the hooks of a turn. In reading order:
+A game carries institutions as values: `Game(..., institutions=(Quota(share=0.8), Tax(rate=0.2)))`. Each kind
+of institution has a module, with four parts:
 
-    arrays      tuples of arrays, allocated and cut into worlds
-    ledger      what all share: who broke what, what is owed, taken and given
-    base        Institution, the base of all values
-    boundaries  Boundaries: regions with owners
-    seasons     ClosedSeason
-    quotas      Quota
-    patches     ClosedPatches
-    rotation    Rotation: agents take turns in harvesting
-    taxes       Tax, and Levies of nested groups
-    votes       Vote, and how ballots are held
-    monitoring  Monitoring: whether violations are detected, and what that costs
-    sanctions   GraduatedSanctions
-    mediation   Mediation of tags
-    punishment  Punishment: fines that cost the one who fines
-    sanctioner  Sanctioner: who may fire
-    hooks       when in a turn the rules of each are called
-    law         all of them together: their kinds, their arrays, and whether they fit a game
+- the value, a dataclass such as `Quota`, with the settings that a user chooses;
+- `Arrays`, a named tuple with its parameters, and with what it remembers in each of B worlds;
+- `parameters(game)`, which returns the parameters among `Arrays`; a module without it takes them from the
+  fields of the value;
+- its rules, functions that `hooks` calls at fixed moments of a turn, and that Numba compiles.
+
+Modules in reading order:
+
+    arrays       allocates named tuples of arrays, and takes single worlds out of them
+    ledger       Ledger, which all institutions share: violations, fines and transfers
+    institution  Institution, the base class of all values
+    boundaries   Boundaries: regions with owners
+    seasons      ClosedSeason: times without harvest
+    quotas       Quota: a limit on each agent's harvest
+    patches      ClosedPatches: no harvest where few apples are left
+    rotation     Rotation: agents harvest in turn
+    taxes        Tax on the harvest, and Levies of nested groups
+    votes        Vote on a tax or a quota, and how ballots are held
+    monitoring   Monitoring: violations are detected by chance, at a cost
+    sanctions    GraduatedSanctions: time-outs and fines that grow with the offences
+    mediation    Mediation: unjust tags are refunded
+    punishment   Punishment: fines that also cost the agent that fines
+    sanctioner   Sanctioner: the only agents that may fire
+    hooks        calls the rules of all institutions at the moments of a turn
+    law          joins the institutions of a game: their parameters, arrays and checks
 """
 
 from typing import NamedTuple
@@ -39,9 +46,9 @@ from cprl.institutions import (
     taxes,
     votes,
 )
-from cprl.institutions.base import Institution
 from cprl.institutions.boundaries import Boundaries
-from cprl.institutions.ledger import COUNTS, Entries, Ledger
+from cprl.institutions.institution import Institution
+from cprl.institutions.ledger import COUNT_NAMES, Entries, Ledger
 from cprl.institutions.mediation import Mediation
 from cprl.institutions.monitoring import Monitoring
 from cprl.institutions.patches import ClosedPatches
@@ -56,8 +63,11 @@ from cprl.institutions.votes import Vote
 
 
 class Law(NamedTuple):
-    """What institutions need in a turn of B worlds: the `Arrays` of each module, in the order in which their
-    rules are called, and what all share."""
+    """The arrays of all institutions for B worlds.
+
+    First come the arrays that institutions share, then the `Arrays` of each module, in the order in which
+    their rules are called.
+    """
 
     ledger: Ledger
     entries: Entries
@@ -76,7 +86,7 @@ class Law(NamedTuple):
 
 
 __all__ = [
-    "COUNTS",
+    "COUNT_NAMES",
     "Boundaries",
     "ClosedPatches",
     "ClosedSeason",

@@ -1,44 +1,41 @@
-"""Tuples of arrays whose annotations say dtype and shape, once: allocated here, and cut into worlds.
+"""Named tuples of arrays: allocate them from their annotations, and take single worlds out of them.
 
-`taken: Annotated[Int32, "B Q N", STEPS]` is int32 with an axis for each word: a letter, whose length whoever
-allocates it says, or a number. An axis B is the first one, of worlds; without it an array is a parameter.
-`Kept` marks what is part of the state of a world, e.g. `STATE` and `STEPS`, and `DERIVED` what is computed
-from the state; what is not marked holds nothing between turns.
+The annotation of a field says the dtype, the axes and the role of its array. For example,
+`taken: Annotated[Int32, "B Q N", STEPS]` is an int32 array with three axes. An axis is a letter, whose length
+is given when the array is allocated, or a number, its length.
+
+The axis B of worlds comes first; an array without it is a parameter of the game. The role is an `InState`,
+such as `IN_STATE` or `STEPS`, for an array that is part of a world's state, and `DERIVED` for an array that
+follows from the state. An array without a role holds nothing between two turns.
 """
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
-from typing import (
-    Annotated,
-    Any,
-    Final,
-    NamedTuple,
-    TypeVar,
-    cast,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, Final, NamedTuple, TypeVar, cast, get_args, get_origin, get_type_hints
 
 import numpy as np
 
 from cprl.values import MOST_INT32
 
 
-class Kept(NamedTuple):
-    """That an array is part of the state of a world, and what is in it."""
+class InState(NamedTuple):
+    """The role of an array that is part of the state of a world, with the range of its entries."""
 
     low: int = 0
     """The smallest entry."""
     high: int | str = MOST_INT32
-    """The largest entry; a name is that of a number of the game, see `cprl.commons.state.numbers`."""
+    """The largest entry: a number, or the name of one that depends on the game, see
+    `cprl.commons.state.largest_entries`."""
     cleared: bool = True
     """Whether all entries are 0 when an episode begins."""
 
 
-STATE: Final = Kept()
-STEPS: Final = Kept(high="episode_steps")
+IN_STATE: Final = InState()
+"""The role of a state array whose entries have no upper limit but that of int32."""
+STEPS: Final = InState(high="episode_steps")
+"""The role of a state array that counts turns, or something that happens at most once per turn."""
 DERIVED: Final = "derived"
+"""The role of an array that follows from the state."""
 
 Tuple = TypeVar("Tuple", bound=tuple[Any, ...])
 Form = tuple[tuple[int, ...], type[np.generic]]
@@ -46,45 +43,56 @@ Form = tuple[tuple[int, ...], type[np.generic]]
 
 
 class Field(NamedTuple):
-    """What the annotation of an array says."""
+    """The annotation of an array in a named tuple, taken apart."""
 
     axes: tuple[str, ...]
+    """The letter, or the length as text, of each axis."""
     dtype: type[np.generic]
-    lasts: Kept | str = ""
-    """How it is kept, `DERIVED`, or nothing."""
+    role: InState | str = ""
+    """An `InState`, `DERIVED`, or "" without a role."""
 
     @property
-    def is_of_worlds(self) -> bool:
+    def has_worlds(self) -> bool:
+        """Return whether the array has the axis B of worlds."""
         return self.axes[:1] == ("B",)
 
 
 @cache
 def _fields(kind: Any) -> Mapping[str, Any]:
-    """Return the `Field` of each array of a tuple; of whatever else it holds the annotation."""
+    """Return the `Field` of each array in a class of named tuples, and the annotation of other fields."""
     hints = get_type_hints(kind, include_extras=True)
     for name, hint in hints.items():
         if get_origin(hint) is Annotated:
-            array, axes, *lasts = get_args(hint)
-            hints[name] = Field(tuple(axes.split()), get_args(get_args(array)[1])[0], *lasts)
+            array, axes, *role = get_args(hint)
+            hints[name] = Field(tuple(axes.split()), get_args(get_args(array)[1])[0], *role)
     return hints
 
 
 def forms_of(kind: Any, **sizes: int) -> dict[str, Form]:
-    """Return the shape and dtype of each array of a tuple; `sizes`: the length of each axis by its letter."""
+    """Return the shape and dtype of each array of a named tuple, by name.
+
+    Args:
+        kind: the class of the named tuple.
+        sizes: the length of each axis by its letter.
+    """
     return {name: (_shape(field, sizes), field.dtype) for name, field in _fields(kind).items()}
 
 
 def _shape(field: Field, sizes: Mapping[str, int]) -> tuple[int, ...]:
+    """Return the shape of an array, from the length of each axis by its letter."""
     return tuple(sizes[axis] if axis in sizes else int(axis) for axis in field.axes)
 
 
 def filled(kind: type[Tuple], values: Mapping[str, Any], **sizes: int) -> Tuple:
-    """Allocate a tuple of arrays, with some values, as arrays, lists or numbers, and else zero.
+    """Make a named tuple of arrays from the given values; arrays without a value are zero.
 
     Args:
-        sizes: see `forms_of`; the axes of values need none.
+        kind: the class of the named tuple.
+        values: arrays, lists or numbers by name. Fields that are no arrays, e.g. tuples, need a value.
+        sizes: the length of each axis by its letter. Axes whose lengths follow from `values` need none.
     """
-    fields, entries = _fields(kind), {}
+    fields = _fields(kind)
+    entries = {}
     for name, field in fields.items():
         if _tuple_in(field) is not None:
             entries[name] = values[name]
@@ -96,89 +104,99 @@ def filled(kind: type[Tuple], values: Mapping[str, Any], **sizes: int) -> Tuple:
     for name, field in fields.items():
         if name not in entries:
             entries[name] = np.zeros(_shape(field, sizes), field.dtype)
-    made: Tuple = cast(Any, kind)(**{name: entries[name] for name in fields})
-    return made
+    arrays: Tuple = cast(Any, kind)(**entries)
+    return arrays
 
 
-def changed(arrays: Tuple, change: Callable[[Any, bool], Any]) -> Tuple:
-    """Return a tuple, with the tuples in it, whose arrays a function of the array and of whether it has an
-    axis of worlds gives."""
+def map_arrays(arrays: Tuple, change: Callable[[Any, bool], Any]) -> Tuple:
+    """Return a copy of a named tuple, and of the tuples in it, in which each array is replaced.
+
+    Args:
+        arrays: the named tuple.
+        change: called as `change(array, has_worlds)`, where `has_worlds` says whether the array has the axis
+            of worlds; returns the new array.
+    """
     entries = []
     for name, entry in zip(arrays._fields, arrays, strict=True):  # type: ignore[attr-defined]
         field = _fields(type(arrays))[name]
         if isinstance(entry, tuple):
-            entries.append(changed(entry, change))
+            entries.append(map_arrays(entry, change))
         elif hasattr(entry, "dtype"):
-            entries.append(change(entry, isinstance(field, Field) and field.is_of_worlds))
+            entries.append(change(entry, isinstance(field, Field) and field.has_worlds))
         else:
             entries.append(entry)
-    made: Tuple = cast(Any, type(arrays))(*entries)
-    return made
+    result: Tuple = cast(Any, type(arrays))(*entries)
+    return result
 
 
-def lasting(arrays: Any, *, derived: bool = False) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the name of each array of a tuple, and of the tuples in it, that is part of the state of a world,
-    the array, and its `Kept`; with `derived` also what is computed from the state, with `DERIVED`."""
+def state_arrays(arrays: Any, *, derived: bool = False) -> Iterator[tuple[str, Any, Any]]:
+    """Yield (name, array, role) for each array of the state in a named tuple, and in the tuples in it.
+
+    The role is an `InState`. With `derived`, also yield the arrays whose role is `DERIVED`.
+    """
     kind: Any = type(arrays)
     for name, entry in zip(arrays._fields, arrays, strict=True):
         field = _fields(kind)[name]
         if isinstance(entry, tuple):
-            yield from lasting(entry, derived=derived)
-        elif isinstance(field, Field) and (isinstance(field.lasts, Kept) or (derived and field.lasts)):
-            yield name, entry, field.lasts
-
-
-def names_kept(kind: Any) -> list[str]:
-    """Return the names of the arrays of a kind of tuple that are part of the state of a world."""
-    fields = _fields(kind).items()
-    return [name for name, field in fields if isinstance(field, Field) and isinstance(field.lasts, Kept)]
+            yield from state_arrays(entry, derived=derived)
+        elif isinstance(field, Field) and (isinstance(field.role, InState) or (derived and field.role)):
+            yield name, entry, field.role
 
 
 class Sliced(NamedTuple):
-    """What the function of a `slicer` does with each entry of a kind of tuple: takes world b out of it, True,
-    or leaves it, False; or does with each entry of the tuple that it is."""
+    """A description of what the function made by `slicer` does, for the compiler of `records`."""
 
     parts: tuple[Any, ...]
+    """For each entry of the tuple: True if world b is taken out of it, False if it stays as it is, and a
+    `Sliced` if it is a tuple itself."""
 
 
 def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
-    """Return a function that takes world b out of a tuple of arrays, and of the tuples in it, sharing their
-    memory; what has no axis of worlds stays, unless `every` says that all have one in front of those of their
-    annotations. Of a tuple that may be None it takes None.
+    """Make a function that takes world b out of a named tuple of arrays, and out of the tuples in it.
 
-    It is written out field by field, so that the rules can call it: Numba compiles no loop over a tuple whose
-    entries differ in type.
+    The function is called as `one_law(arrays, b)`, and its result shares the memory of the arrays. Entries
+    without the axis of worlds stay as they are. For None it returns None.
+
+    Args:
+        kind: the class of the named tuple.
+        every: whether all arrays have the axis of worlds, in front of the axes of their annotations.
     """
+    # The function is written out as source, field by field, so that rules can call it: Numba compiles no loop
+    # over a tuple whose entries differ in type.
     names: dict[str, Any] = {"__name__": __name__, "kind": kind}
     entries = []
     parts: list[Any] = []
     for name, field in _fields(kind).items():
         entry = f"arrays.{name}"
-        inner = _tuple_in(field)
-        if inner is not None:
-            one: Any = slicer(inner, every=every)
-            names[f"one_{name}"] = one
+        inner_kind = _tuple_in(field)
+        if inner_kind is not None:
+            inner_function: Any = slicer(inner_kind, every=every)
+            names[f"one_{name}"] = inner_function
             entry = f"one_{name}({entry}, b)"
-            parts.append(one.sliced)
-        elif every or (isinstance(field, Field) and field.is_of_worlds):
+            parts.append(inner_function.sliced)
+        elif every or (isinstance(field, Field) and field.has_worlds):
             entry += "[b]"
             parts.append(True)
         else:
             parts.append(False)
         entries.append(entry)
-    name = f"one_{kind.__name__.lower()}"
-    lines = f"def {name}(arrays, b):", "if arrays is None: return None", f"return kind({', '.join(entries)})"
+    function_name = f"one_{kind.__name__.lower()}"
+    lines = (
+        f"def {function_name}(arrays, b):",
+        "if arrays is None: return None",
+        f"return kind({', '.join(entries)})",
+    )
     exec("\n    ".join(lines), names)
-    function: Any = names[name]
+    function: Any = names[function_name]
     function.sliced = Sliced(tuple(parts))
     return cast(Callable[[Any, int], Any], function)
 
 
 def is_record(kind: Any) -> bool:
-    """Return whether something is a kind of named tuple."""
+    """Return whether a value is a class of named tuples, e.g. `Worlds`."""
     return isinstance(kind, type) and hasattr(kind, "_fields")
 
 
 def _tuple_in(field: Any) -> type[Any] | None:
-    """Return the kind of tuple that an annotation names, also one that may be None; None for another."""
+    """Return the class of named tuples in an annotation such as `Arrays` or `Arrays | None`; None without."""
     return next(filter(is_record, (field, *get_args(field))), None)

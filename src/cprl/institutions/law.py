@@ -1,17 +1,15 @@
-"""Law: the institutions of a game together: which kinds there are, their arrays, and whether they fit.
+"""The institutions of a game taken together: make their arrays, and check that they fit the game.
 
-How they act in a turn is in `cprl.institutions.hooks`.
+`cprl.institutions.hooks` has the moments of a turn at which they act.
 """
 
-from collections.abc import Iterable
 from importlib import import_module
-from types import ModuleType
 from typing import Any, Final, cast
 
 from cprl.institutions import Law
-from cprl.institutions.arrays import filled, names_kept
-from cprl.institutions.base import Institution, numbered
-from cprl.institutions.ledger import COUNTS, Ledger
+from cprl.institutions.arrays import filled
+from cprl.institutions.institution import Institution, columns, numbered
+from cprl.institutions.ledger import COUNT_NAMES, Ledger
 from cprl.institutions.votes import MOST_DECISIONS
 
 MODULES: Final = {
@@ -19,120 +17,77 @@ MODULES: Final = {
     for name, kind in Law.__annotations__.items()
     if kind.__name__ == "Arrays"
 }
-"""The modules of kinds by their fields of `Law`, which have the modules' names."""
+"""The modules of institutions by their fields in `Law`, which have the names of the modules."""
 
 
-def _classes_of(module: ModuleType) -> list[type[Any]]:
-    """Return the classes that a module defines."""
-    return [
-        kind
-        for kind in vars(module).values()
-        if isinstance(kind, type) and kind.__module__ == module.__name__
-    ]
-
-
-KINDS: Final[tuple[type[Institution], ...]] = tuple(
-    kind for module in MODULES.values() for kind in _classes_of(module) if issubclass(kind, Institution)
+INSTITUTION_KINDS: Final[tuple[type[Institution], ...]] = tuple(
+    kind
+    for module in MODULES.values()
+    for kind in vars(module).values()
+    if isinstance(kind, type) and issubclass(kind, Institution) and kind.__module__ == module.__name__
 )
-"""All kinds of institutions that a game can have."""
-
-
-def check_names(modules: Iterable[ModuleType]) -> None:
-    """Check that no name is claimed twice, of arrays in the state of a world or of entries shown to agents:
-    states, and what is shown, go by these names alone.
-
-    Raises:
-        ValueError: with the name, and both classes with their modules.
-    """
-    owners: dict[str, str] = {}
-    for kind in (kind for module in modules for kind in _classes_of(module)):
-        owner = f"{kind.__module__}.{kind.__name__}"
-        for name in _claims_of(kind):
-            if owners.setdefault(name, owner) != owner:
-                raise ValueError(
-                    f"{owners[name]} and {owner} both have the {name}; allowed: a name of its own in each"
-                )
-
-
-def _claims_of(kind: type[Any]) -> list[str]:
-    """Return the arrays, or the entries shown to agents, whose names no other class may claim."""
-    if issubclass(kind, Institution):
-        return [f"entry {name!r}" for name in kind.entries]
-    if issubclass(kind, tuple):
-        return [f"array {name!r}" for name in names_kept(kind)]
-    return []
+"""The classes of all institutions that a game can have."""
 
 
 def entries_shown(game: Any) -> list[tuple[str, int]]:
-    """Return what the institutions of a game show agents, in their order, each with the number of which
-    one."""
+    """Return the (entry, argument) pairs that the institutions of a game show agents, in their order."""
     entries: list[tuple[str, int]] = []
-    seen = dict.fromkeys(KINDS, 0)
+    earlier_of_kind = dict.fromkeys(INSTITUTION_KINDS, 0)
     for institution, ballot in numbered(game):
-        for part in dict.fromkeys((institution, institution.rule)):
-            if part.observed:
-                entries += part.shows(number=seen[type(part)], ballot=ballot, agents=game.agents)
-            seen[type(part)] += 1
+        # A vote shows its result, and the institution that is voted on shows its own entries.
+        for rule in dict.fromkeys((institution, institution.rule)):
+            if rule.observed:
+                index_in_kind = earlier_of_kind[type(rule)]
+                entries += rule.shows(number=index_in_kind, ballot=ballot, agents=game.agents)
+            earlier_of_kind[type(rule)] += 1
     return entries
 
 
 def parameters(game: Any) -> dict[str, dict[str, Any]]:
-    """Return the parameters of a game's institutions, by the fields of `Law`."""
-    places = {
-        entry: (Law._fields.index(kind.__module__.rpartition(".")[2]), what)
-        for kind in KINDS
-        for what, entry in enumerate(kind.entries)
+    """Return the parameters of a game's institutions by the field of `Law`, then by the array's name."""
+    module_and_index = {
+        entry: (Law._fields.index(kind.__module__.rpartition(".")[2]), index)
+        for kind in INSTITUTION_KINDS
+        for index, entry in enumerate(kind.entries)
     }
     shown_entries = entries_shown(game)
     entries = {
-        "module": [places[entry][0] for entry, _ in shown_entries],
-        "what": [places[entry][1] for entry, _ in shown_entries],
-        "argument": [number for _, number in shown_entries],
+        "module": [module_and_index[entry][0] for entry, _ in shown_entries],
+        "what": [module_and_index[entry][1] for entry, _ in shown_entries],
+        "argument": [argument for _, argument in shown_entries],
         "places": shows_places(game),
-        "first_plane": len(game.own_channels),
+        "first_plane": len(game.game_channels),
     }
-    of_modules = {name: module.parameters(game) for name, module in MODULES.items()}
-    return {"entries": entries, **of_modules}
+    return {"entries": entries} | {name: _parameters(module, game) for name, module in MODULES.items()}
+
+
+def _parameters(module: Any, game: Any) -> dict[str, Any]:
+    """Return the parameters of one module: those of its function `parameters`, or else the fields of its
+    institutions in the game."""
+    if hasattr(module, "parameters"):
+        return module.parameters(game)
+    (kind,) = (kind for kind in INSTITUTION_KINDS if kind.__module__ == module.__name__)
+    return columns(kind, module.Arrays, game)
 
 
 def new_law(game: Any, worlds: int) -> Law:
-    """Return the law of B worlds of a game, in which nothing has happened and the first choice of each ballot
-    is in force."""
-    given = game.law_parameters
-    sizes = {"B": worlds, "N": game.agents, "C": len(COUNTS), "V": len(game.ballots)}
-    kinds = Law.__annotations__
-    parts = {name: filled(kinds[name], values, **sizes) for name, values in given.items()}
+    """Return the arrays of a game's institutions for B worlds in which nothing has happened yet.
+
+    The first choice of each ballot is in force.
+    """
+    sizes = {"B": worlds, "N": game.agents, "C": len(COUNT_NAMES), "V": len(game.ballots)}
+    classes = Law.__annotations__
+    arrays = {name: filled(classes[name], values, **sizes) for name, values in game.law_parameters.items()}
     ledger = filled(Ledger, {}, **sizes)
-    ledger.in_force[:] = parts["votes"].choices[:, 0]
-    return cast(Any, Law)(ledger=ledger, **parts)
+    ledger.in_force[:] = arrays["votes"].choices[:, 0]
+    return cast(Any, Law)(ledger=ledger, **arrays)
 
 
 def check_institutions(game: Any) -> None:
-    """Check that the institutions of a game fit each other, its map, rules and observation."""
+    """Raise a ValueError if the institutions of a game do not fit each other or the rest of the game."""
     for institution in game.institutions:
-        kind = type(institution)
-        if kind not in KINDS:
-            raise ValueError(
-                f"Game.institutions has a {kind.__name__}; allowed: "
-                f"{', '.join(known.__name__ for known in KINDS)}; an institution of your own is a "
-                "TorchRL transform, see docs/institutions.md"
-            )
-        of_kind = sum(type(other) is kind for other in game.institutions)
-        if kind.at_most is not None and of_kind > kind.at_most:
-            raise ValueError(
-                f"Game.institutions has {of_kind} of {kind.__name__}; allowed: at most {kind.at_most}"
-            )
-        for switch in kind.needs:
-            if institution.observed and not getattr(game.observation, switch):
-                raise ValueError(
-                    f"{kind.__name__}.observed is True and Observation.{switch} is False; allowed: "
-                    f"Observation({switch}=True), or {kind.__name__}(observed=False)"
-                )
-        if institution.needs_tags and not game.rules.may_fire:
-            raise ValueError(
-                f"Game.institutions has a {kind.__name__} and Rules.may_fire is False; allowed: a game in "
-                "which agents may fire"
-            )
+        _check_kind(institution, game)
+        _check_needs(institution, game)
         institution.check(game)
     if game.decisions > MOST_DECISIONS:
         raise ValueError(
@@ -141,6 +96,36 @@ def check_institutions(game: Any) -> None:
         )
 
 
+def _check_kind(institution: Institution, game: Any) -> None:
+    """Refuse an institution of an unknown class, and too many of one class."""
+    kind = type(institution)
+    if kind not in INSTITUTION_KINDS:
+        raise ValueError(
+            f"Game.institutions has a {kind.__name__}; allowed: "
+            f"{', '.join(known.__name__ for known in INSTITUTION_KINDS)}; an institution of your own is "
+            "a TorchRL transform, see docs/institutions.md"
+        )
+    count = sum(type(other) is kind for other in game.institutions)
+    if kind.at_most is not None and count > kind.at_most:
+        raise ValueError(f"Game.institutions has {count} of {kind.__name__}; allowed: at most {kind.at_most}")
+
+
+def _check_needs(institution: Institution, game: Any) -> None:
+    """Refuse an institution in a game without the observations or beams that it needs."""
+    kind = type(institution)
+    for switch in kind.needs:
+        if institution.observed and not getattr(game.observation, switch):
+            raise ValueError(
+                f"{kind.__name__}.observed is True and Observation.{switch} is False; allowed: "
+                f"Observation({switch}=True), or {kind.__name__}(observed=False)"
+            )
+    if institution.needs_tags and not game.rules.may_fire:
+        raise ValueError(
+            f"Game.institutions has a {kind.__name__} and Rules.may_fire is False; allowed: a game in "
+            "which agents may fire"
+        )
+
+
 def shows_places(game: Any) -> bool:
-    """Return whether agents of a game see where bites are forbidden."""
+    """Return whether institutions show agents the cells where they may not harvest."""
     return any(institution.shows_places and institution.observed for institution in game.institutions)

@@ -1,30 +1,31 @@
-"""Mediation: tags of agents that broke no rule are refunded."""
+"""Mediation: the shooter pays a refund for a tag of an agent that broke no rule."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
-from cprl.institutions.base import Amount, Institution, columns
+from cprl.institutions.institution import Amount, Institution
 from cprl.institutions.ledger import UNJUST_TAGS, Ledger
 from cprl.values import Positive
-from cprl.values.arrays import Bool, Float64, Int32
+from cprl.values.array_types import Bool, Float64, Int32
 
 
 @dataclass(frozen=True, kw_only=True)
 class Mediation(Institution):
-    """A tag of an agent that broke no rule is unjust, and refunded by the shooter (Ostrom's principle 6,
-    conflict resolution).
+    """A tag of an agent that broke no rule is unjust, and the shooter pays a refund for it.
 
-    A tag is unjust if the tagged agent has violated no rule in this turn and the `turns` - 1 before it. It is
-    a violation by each agent that tagged; together they pay `refund` to the tagged one, detected or not.
-    Agents observe which agents have violated a rule in the last `turns`, their own mark first, then those of
-    the following indices, cyclically; to know them apart they need `Observation.agents_apart`.
+    This is Ostrom's principle 6, conflict resolution. A tag is unjust if the tagged agent has violated no
+    rule in this turn and the `turns` - 1 turns before it. Then each agent that tagged it commits a violation,
+    and together they pay `refund` to the tagged agent, whether that is detected or not.
+
+    Agents observe which agents have violated a rule in the last `turns`: the observer first, then the agents
+    with the following indices, cyclically. To tell these agents apart they need `Observation.agents_apart`.
     """
 
     turns: Positive = 10
     """The number of turns, this one included, in which a violation justifies a tag."""
 
     refund: Amount = 1.0
-    """The apples that the tagged agent is paid."""
+    """The apples that the tagged agent receives."""
 
     entries: ClassVar[tuple[str, ...]] = ("violator",)
     at_most: ClassVar[int | None] = 1
@@ -44,25 +45,21 @@ class Mediation(Institution):
 
 
 class Arrays(NamedTuple):
-    """The mediation of a game: of axis M there is one, or none."""
+    """The parameters of a game's `Mediation`; axis M has length 1, or 0 without it."""
 
     turns: Annotated[Int32, "M"]
     refund: Annotated[Float64, "M"]
 
 
-def parameters(game: Any) -> dict[str, Any]:
-    return columns(Mediation, Arrays, game)
-
-
 def mediate(mediation: Arrays, ledger: Ledger, tagged_by: Bool, turn: int) -> None:
-    """Refund agents that were tagged but broke no rule in the last turns; `tagged_by`: bool [N, N]."""
+    """Refund all agents that were tagged unjustly; `tagged_by`: bool [N, N], agent tagged, shooter."""
     if mediation.turns.shape[0] > 0:
         for i in range(tagged_by.shape[0]):
             refund_tag(mediation, ledger, tagged_by, i, turn)
 
 
 def refund_tag(mediation: Arrays, ledger: Ledger, tagged_by: Bool, i: int, turn: int) -> None:
-    """Refund agent i for a tag, if there was any and it was unjust."""
+    """Refund agent i if it was tagged and broke no rule, and let the shooters pay in equal parts."""
     shooters = 0
     for j in range(tagged_by.shape[0]):
         shooters += tagged_by[i, j]
@@ -77,11 +74,12 @@ def refund_tag(mediation: Arrays, ledger: Ledger, tagged_by: Bool, i: int, turn:
 
 
 def has_mark(mediation: Arrays, ledger: Ledger, i: int, turn: int) -> bool:
-    """Return whether agent i violated a rule in the turns before this one that justify a tag in it."""
+    """Return whether agent i violated a rule so few turns before this one that a tag in it is just."""
     return ledger.violation_step[i] > 0 and turn - ledger.violation_step[i] < mediation.turns[0]
 
 
 def show_mark(mediation: Arrays, ledger: Ledger, offset: int, i: int, turn: int) -> float:
-    """1 if the agent so many indices after i violated a rule in the last turns."""
+    """Return what agent i observes of the agent `offset` indices after it: 1 if that violated a rule in the
+    last turns, else 0."""
     agent = (i + offset) % ledger.fines.shape[0]
     return 1.0 if has_mark(mediation, ledger, agent, turn + 1) else 0.0

@@ -1,9 +1,9 @@
-"""Monitoring: violations are detected, or not, at a cost."""
+"""Monitoring: violations are detected with a probability, and inspection costs apples."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final, Literal, NamedTuple
 
-from cprl.institutions.base import (
+from cprl.institutions.institution import (
     A_RULE_TO_BREAK,
     Amount,
     Ballot,
@@ -17,29 +17,31 @@ from cprl.institutions.ledger import Ledger
 from cprl.values import Natural, Positive, Share
 
 ELECTED: Final = "elected"
+"""The value of `Monitoring.monitor` for an agent that all agents elect."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Monitoring(Institution):
-    """Violations are detected with a probability, and inspection has a cost (Ostrom's principle 4).
+    """Violations are detected only with a probability, and inspection has a cost.
 
-    Each turn in which an agent violates a rule is detected with probability `prob`, by the game's own
-    counters; only then fines and sanctions follow. Without Monitoring every violation is detected. Agents
-    observe whether they were detected in the last turn.
+    This is Ostrom's principle 4, monitoring. Each turn in which an agent violates a rule is detected with
+    probability `prob`, drawn from the random numbers of the game, and only then fines and sanctions follow.
+    In a game without Monitoring every violation is detected. Agents observe whether a violation of theirs was
+    detected in the last turn.
     """
 
     prob: Share = 0.5
     """The probability that a turn with a violation is detected."""
 
     cost: Amount = 0.0
-    """Apples per turn that inspection costs."""
+    """The cost of inspection in apples per turn."""
 
     monitor: Natural | Literal["elected"] | None = None
-    """Who pays the cost: an agent index, "elected" for the one that all elect, or None for all in equal
-    parts."""
+    """The agent that pays the cost: the index of an agent, "elected" for an agent that all elect, or None for
+    all agents in equal parts."""
 
     period_episodes: Positive = 1
-    """An election is held in every such number of episodes, from the first one."""
+    """The number of episodes from one election to the next; the first one is in the first episode."""
 
     entries: ClassVar[tuple[str, ...]] = ("detected", "elected")
     at_most: ClassVar[int | None] = 1
@@ -68,18 +70,19 @@ class Monitoring(Institution):
 
 
 class Arrays(NamedTuple):
-    """How violations are detected."""
+    """The parameters of the detection of violations, in any game."""
 
     detected_below: int
     """A violation is detected if a uniform 32-bit word is below this threshold."""
     cost: float
     payer: int
-    """Who pays it; -1 for all."""
+    """The index of the agent that pays the cost; -1 for all agents."""
     ballot: int
-    """The ballot that elects who pays it; -1 for none."""
+    """The ballot that elects the payer; -1 for none."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
+    """Return the parameters in `Arrays` by name; without `Monitoring` every violation is detected."""
     monitoring, ballot = next(iter(with_ballots(game, Monitoring)), (Monitoring(prob=1.0), -1))
     payer = monitoring.monitor if isinstance(monitoring.monitor, int) else -1
     below = threshold(monitoring.prob)
@@ -87,10 +90,11 @@ def parameters(game: Any) -> dict[str, Any]:
 
 
 def charge_inspection(monitoring: Arrays, ledger: Ledger) -> None:
-    """Charge the cost of inspection to who monitors, or to all in equal parts."""
+    """Let the agent that monitors, or all agents in equal parts, pay the cost of inspection."""
     if monitoring.cost == 0:
         return
-    agents, payer = ledger.fines.shape[0], monitoring.payer
+    agents = ledger.fines.shape[0]
+    payer = monitoring.payer
     if monitoring.ballot >= 0:
         payer = int(ledger.in_force[monitoring.ballot])
     for i in range(agents):
@@ -101,7 +105,11 @@ def charge_inspection(monitoring: Arrays, ledger: Ledger) -> None:
 
 
 def show_monitoring(monitoring: Arrays, ledger: Ledger, what: int, ballot: int, i: int) -> float:
-    """1 if a violation of the agent was detected in the last turn; with an election, 1 if it monitors."""
+    """Return what agent i observes of monitoring after a turn, 0 or 1.
+
+    Entry 0 is 1 if a violation of agent i was detected in the turn; entry 1 is 1 if it is the elected
+    monitor. `what`: the index of the entry.
+    """
     if what == 0:
         return 1.0 if ledger.detected[i] else 0.0
     return 1.0 if ledger.in_force[ballot] == i else 0.0

@@ -1,4 +1,4 @@
-"""ClosedPatches: a patch is closed while it holds too few apples."""
+"""ClosedPatches: nobody may harvest a patch of sites while it holds too few apples."""
 
 import warnings
 from dataclasses import dataclass
@@ -7,26 +7,27 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 
 from cprl.institutions.arrays import DERIVED
-from cprl.institutions.base import Amount, Limit, columns, with_ballots
+from cprl.institutions.institution import Amount, Limit, columns, with_ballots
 from cprl.values import Natural
-from cprl.values.arrays import Bool, Float64, Int32, UInt8
+from cprl.values.array_types import Bool, Float64, Int32, UInt8
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedPatches(Limit):
-    """A patch is closed while it holds too few apples (Ostrom's principle 2).
+    """A patch of sites is closed for harvests while it holds too few apples.
 
-    A patch is a set of sites that are connected by being near each other (`Rules.regrow_radius_cells`). It is
-    closed in every turn that begins with fewer than `below` apples on it. Agents observe, for each cell of
-    their window, whether a bite there would break a rule.
+    This is Ostrom's principle 2, rules that fit local conditions. Two sites belong to one patch if they are
+    near each other (`Rules.regrow_radius_cells`), directly or through other sites. A patch is closed in every
+    turn that begins with fewer than `below` apples on it. Agents observe for each cell of their window
+    whether a harvest there would break a rule.
     """
 
     below: Natural = 2
     """The number of apples below which a patch is closed."""
 
     fine: Amount | None = None
-    """None: nobody can harvest in a closed patch. A number: it can be done, is a violation, and each bite
-    costs so many apples if it is detected."""
+    """The fine in apples for each harvest in a closed patch, which is a violation, if it is detected. None
+    makes such harvests impossible."""
 
     at_most: ClassVar[int | None] = 1
     shows_places: ClassVar[bool] = True
@@ -45,24 +46,26 @@ class ClosedPatches(Limit):
 
 
 class Arrays(NamedTuple):
-    """The patches of a game, one per index of axis P; none without `ClosedPatches`."""
+    """The patches of a game, on axis P; there are none in a game without `ClosedPatches`."""
 
     patch_of: Annotated[Int32, "K"]
-    """The patch of each site."""
+    """The index of each site's patch."""
     sites: Annotated[Int32, "P"]
-    """Sites per patch."""
+    """The number of sites in each patch."""
     below: Annotated[Int32, "L"]
-    """Of axis L there is one, or none."""
+    """The number of apples below which a patch is closed; axis L has length 1, or 0 without the
+    institution."""
     is_stopped: Annotated[Bool, "L"]
     fine: Annotated[Float64, "L"]
     observed: Annotated[Bool, "L"]
     closed: Annotated[Bool, "B P", DERIVED]
-    """Whether the patch is closed in the coming turn."""
+    """True for patches that are closed in the coming turn."""
     stock: Annotated[Int32, "B P", DERIVED]
-    """Apples on each patch."""
+    """The number of apples on each patch."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
+    """Return the parameters in `Arrays` by name."""
     patch_of = game.patches if with_ballots(game, ClosedPatches) else np.zeros(0, np.int32)
     sites = np.bincount(patch_of)
     return {"patch_of": patch_of, "sites": sites, **columns(ClosedPatches, Arrays, game)}
@@ -74,13 +77,13 @@ def is_patch_closed(patches: Arrays, site: int) -> bool:
 
 
 def count_apple(patches: Arrays, site: int, change: int) -> None:
-    """Count an apple that has appeared on a site, change 1, or is gone from it, change -1."""
+    """Update the apples of a patch: an apple has appeared on a site (`change` 1) or gone (`change` -1)."""
     if patches.sites.shape[0] > 0:
         patches.stock[patches.patch_of[site]] += change
 
 
 def count_apples(patches: Arrays, stock: UInt8) -> None:
-    """Count the apples on each patch; `stock`: uint8 [K]."""
+    """Count the apples on each patch, and close patches accordingly; `stock`: uint8 [K]."""
     if patches.sites.shape[0] > 0:
         for p in range(patches.sites.shape[0]):
             patches.stock[p] = 0
@@ -90,13 +93,13 @@ def count_apples(patches: Arrays, stock: UInt8) -> None:
 
 
 def close_patches(patches: Arrays) -> None:
-    """Write which patches are closed in the coming turn."""
+    """Close the patches that hold too few apples for the coming turn, and open all others."""
     for p in range(patches.sites.shape[0]):
         patches.closed[p] = patches.stock[p] < patches.below[0]
 
 
 def shows_closed(patches: Arrays, site: int) -> bool:
-    """Return whether agents see that the patch of a site is closed; -1: where there is no site."""
+    """Return whether agents observe that the patch of a site is closed; `site`: -1 for a cell without one."""
     if patches.observed.shape[0] == 0 or not patches.observed[0] or site < 0:
         return False
     return is_patch_closed(patches, site)

@@ -5,40 +5,40 @@ import warnings
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
-from cprl.institutions.arrays import STEPS, Kept
-from cprl.institutions.base import Amount, Limit, columns, with_ballots
+from cprl.institutions.arrays import STEPS, InState
+from cprl.institutions.institution import Amount, Limit, columns, with_ballots
 from cprl.institutions.ledger import Ledger
 from cprl.values import Positive, Range
-from cprl.values.arrays import Bool, Float64, Int32
+from cprl.values.array_types import Bool, Float64, Int32
 
 ROUNDING: Final = 1e-9
-"""Apples by which a quota may be exceeded: the rounding of its computation."""
+"""The apples by which a harvest may exceed a quota, which allows for rounding errors."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Quota(Limit):
-    """A limit on each agent's harvest in a window of time, as a share of what the map can bear (Ostrom's
-    principle 2, rules that fit local conditions).
+    """A limit on each agent's harvest in a window of time, as a share of the sustainable yield.
 
-    Windows follow one another from the first turn of an episode. In each, an agent may harvest up to
-    share x yield x window_steps / N apples, where the yield is `cprl.commons.yields.sustainable_yield`, a
-    proven lower bound (on a map with a river: while that is clean). Agents observe the part of their quota
-    that is left and the time left in the window.
+    This is Ostrom's principle 2, rules that fit local conditions. Windows follow one another from the first
+    turn of an episode. In each window an agent may harvest up to share x yield x window_steps / N apples. The
+    yield is the proven lower bound of `cprl.commons.yields.sustainable_yield`, on a map with a river the one
+    while the river is clean. Agents observe the part of their quota that is left, and the time left in the
+    window.
     """
 
     share: Annotated[float, Range(0, 1e6)] = 1.0
-    """Of the sustainable yield that all agents together may take."""
+    """The share of the sustainable yield that all agents together may take."""
 
     window_steps: Positive = 50
     """The length of a window in turns."""
 
     by_stock: bool = False
-    """Whether the quota of a window is multiplied by the share of all sites that hold an apple when it
-    begins."""
+    """Whether the quota of a window is multiplied by the share of all sites that hold an apple when the
+    window begins."""
 
     fine: Amount | None = None
-    """None: nobody can harvest more. A number: it can be done, is a violation, and each bite above the quota
-    costs so many apples if it is detected."""
+    """The fine in apples for each harvest above the quota, which is a violation, if it is detected. None
+    makes such harvests impossible."""
 
     counts: ClassVar[tuple[str, ...]] = ("excess_bites",)
     entries: ClassVar[tuple[str, ...]] = ("quota left", "quota time")
@@ -46,12 +46,12 @@ class Quota(Limit):
 
 
 class Arrays(NamedTuple):
-    """All quotas of a game, one per index of axis Q."""
+    """The parameters and memory of all `Quota` of a game, one of them per index of axis Q."""
 
     unit: Annotated[Float64, "Q"]
-    """Apples per agent and window at a share of 1."""
+    """The apples that an agent may harvest in a window at a share of 1."""
     full: Annotated[Float64, "Q"]
-    """The most apples that an agent may harvest in a window, for what agents are shown."""
+    """The most apples that an agent may ever harvest in a window; what agents observe is relative to it."""
     share: Annotated[Float64, "Q"]
     ballot: Annotated[Int32, "Q"]
     """The ballot that decides the share; -1 for none."""
@@ -59,38 +59,45 @@ class Arrays(NamedTuple):
     by_stock: Annotated[Bool, "Q"]
     is_stopped: Annotated[Bool, "Q"]
     fine: Annotated[Float64, "Q"]
-    allowed: Annotated[Float64, "B Q", Kept(cleared=False)]
+    allowed: Annotated[Float64, "B Q", InState(cleared=False)]
     """The apples that an agent may harvest in the current window."""
     taken: Annotated[Int32, "B Q N", STEPS]
-    """Apples harvested in the current window."""
+    """The apples that each agent has harvested in the current window."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
+    """Return the parameters in `Arrays` by name."""
     quotas = with_ballots(game, Quota)
-    of_agent = game.sustainable_yield / game.agents if quotas else 0.0
-    most = [quota.share if ballot < 0 else game.ballots[ballot].choices[-1] for quota, ballot in quotas]
-    for (quota, _), share in zip(quotas, most, strict=True):
-        _warn_of_less_than_an_apple(quota, of_agent * share)
-    unit = [of_agent * quota.window_steps for quota, _ in quotas]
-    full = [share * apples for share, apples in zip(most, unit, strict=True)]
+    agent_yield = game.sustainable_yield / game.agents if quotas else 0.0
+    largest_shares = [
+        quota.share if ballot < 0 else game.ballots[ballot].choices[-1] for quota, ballot in quotas
+    ]
+    for (quota, _), share in zip(quotas, largest_shares, strict=True):
+        _warn_of_less_than_an_apple(quota, agent_yield * share)
+    unit = [agent_yield * quota.window_steps for quota, _ in quotas]
+    full = [share * apples for share, apples in zip(largest_shares, unit, strict=True)]
     return {"unit": unit, "full": full, **columns(Quota, Arrays, game)}
 
 
-def _warn_of_less_than_an_apple(quota: Quota, apples_a_turn: float) -> None:
-    """Warn of a quota that stops every bite although its share is not 0."""
-    apples = apples_a_turn * quota.window_steps
+def _warn_of_less_than_an_apple(quota: Quota, apples_per_turn: float) -> None:
+    """Warn (UserWarning) of a quota that allows less than one apple in a window, so that nobody ever
+    harvests."""
+    apples = apples_per_turn * quota.window_steps
     if quota.fine is None and 0 < apples < 1 - ROUNDING:
         warnings.warn(
             f"Quota.window_steps is {quota.window_steps}: in such a window an agent may take {apples:.3g} "
             "apples at most, so nobody ever harvests; an apple is allowed in windows of "
-            f"{math.ceil((1 - ROUNDING) / apples_a_turn)} turns or more",
+            f"{math.ceil((1 - ROUNDING) / apples_per_turn)} turns or more",
             UserWarning,
             stacklevel=2,
         )
 
 
 def open_windows(quotas: Arrays, ledger: Ledger, turn: int, stock_share: float) -> None:
-    """Begin the windows that begin with a turn; `stock_share`: the share of all sites that hold an apple."""
+    """Open the windows that begin with a turn, and compute how much agents may harvest in them.
+
+    `stock_share`: the share of all sites that hold an apple.
+    """
     for q in range(quotas.window_steps.shape[0]):
         if (turn - 1) % quotas.window_steps[q] == 0:
             share = quotas.share[q]
@@ -104,19 +111,22 @@ def open_windows(quotas: Arrays, ledger: Ledger, turn: int, stock_share: float) 
 
 
 def is_used_up(quotas: Arrays, q: int, i: int) -> bool:
-    """Return whether one more harvest of agent i is above its quota."""
+    """Return whether one more harvest of agent i would exceed quota q."""
     return quotas.taken[q, i] + 1 > quotas.allowed[q] + ROUNDING
 
 
 def use_quotas(quotas: Arrays, i: int) -> None:
-    """Count a harvest of agent i."""
+    """Count a harvest of agent i for all quotas."""
     for q in range(quotas.window_steps.shape[0]):
         quotas.taken[q, i] += 1
 
 
 def show_quota(quotas: Arrays, what: int, q: int, i: int, turn: int) -> float:
-    """Return the apples left to agent i, relative to the most that they can be; the part of the window
-    left."""
+    """Return what agent i observes of quota q after a turn, 0..1.
+
+    Entry 0 is the number of apples that it may still harvest, relative to the largest quota; entry 1 is the
+    part of the window that is left. `what`: the index of the entry.
+    """
     if what == 1:
         return (quotas.window_steps[q] - turn % quotas.window_steps[q]) / quotas.window_steps[q]
     left = quotas.allowed[q] - quotas.taken[q, i]

@@ -1,54 +1,54 @@
 """Rotation: agents take turns in harvesting."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
-from cprl.institutions.base import Amount, Limit, columns
+from cprl.institutions.institution import Amount, Limit
 from cprl.institutions.ledger import Ledger
 from cprl.values import Positive
-from cprl.values.arrays import Bool, Float64, Int32
+from cprl.values.array_types import Bool, Float64, Int32
 
 
 @dataclass(frozen=True, kw_only=True)
 class Rotation(Limit):
-    """A right of access that goes round: in each window of turns one agent may harvest (Ostrom's principle
-    2, rules that fit local conditions).
+    """Agents take turns in harvesting: in each window of time only one agent may harvest.
 
-    Windows follow one another from the first turn of an episode: the first one belongs to agent 0, the next
-    to agent 1, and so on, and after the last agent's to agent 0 again. Agents observe whether they may
-    harvest in the coming turn, and the part of the window that is left.
+    This is Ostrom's principle 2, rules that fit local conditions. Windows follow one another from the first
+    turn of an episode. The first window belongs to agent 0, the next one to agent 1, and so on; after the
+    last agent it is agent 0 again. Agents observe whether they may harvest in the coming turn, and the part
+    of the window that is left.
     """
 
     window_steps: Positive = 25
     """The length of a window in turns."""
 
     fine: Amount | None = None
-    """None: nobody else can harvest. A number: it can be done, is a violation, and each bite costs so many
-    apples if it is detected."""
+    """The fine in apples for each harvest out of turn, which is a violation, if it is detected. None makes
+    such harvests impossible."""
 
     counts: ClassVar[tuple[str, ...]] = ("closed_bites",)
     entries: ClassVar[tuple[str, ...]] = ("may harvest", "window time")
 
 
 class Arrays(NamedTuple):
-    """All rotations of a game, one per index of axis R."""
+    """The parameters of all `Rotation` of a game, one of them per index of axis R."""
 
     window_steps: Annotated[Int32, "R"]
     is_stopped: Annotated[Bool, "R"]
     fine: Annotated[Float64, "R"]
 
 
-def parameters(game: Any) -> dict[str, Any]:
-    return columns(Rotation, Arrays, game)
-
-
 def is_out_of_turn(rotations: Arrays, ledger: Ledger, r: int, i: int, turn: int) -> bool:
-    """Return whether a turn is not agent i's to harvest."""
+    """Return whether agent i may not harvest in a turn, counted from 1, under rotation r."""
     return (turn - 1) // rotations.window_steps[r] % ledger.fines.shape[0] != i
 
 
 def show_rotation(rotations: Arrays, ledger: Ledger, what: int, r: int, i: int, turn: int) -> float:
-    """1 if agent i may harvest in the coming turn; the part of the window that is left."""
+    """Return what agent i observes of rotation r after a turn, 0..1.
+
+    Entry 0 is 1 if it may harvest in the coming turn; entry 1 is the part of the window that is left. `what`:
+    the index of the entry.
+    """
     if what == 0:
         return 0.0 if is_out_of_turn(rotations, ledger, r, i, turn + 1) else 1.0
     return (rotations.window_steps[r] - turn % rotations.window_steps[r]) / rotations.window_steps[r]

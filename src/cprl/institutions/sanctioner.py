@@ -1,33 +1,39 @@
-"""Sanctioner: only some agents may fire."""
+"""Sanctioner: only some agents may fire, listed or elected ones."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, NamedTuple
 
 from cprl.institutions.arrays import DERIVED
-from cprl.institutions.base import Ballot, Institution, check_agent_indices, check_no_election, with_ballots
+from cprl.institutions.institution import (
+    Ballot,
+    Institution,
+    check_agent_indices,
+    check_no_election,
+    with_ballots,
+)
 from cprl.institutions.ledger import Ledger
 from cprl.values import AgentIndices, Positive, Share
-from cprl.values.arrays import Bool
+from cprl.values.array_types import Bool
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sanctioner(Institution):
-    """Only some agents may fire: named ones, or the one that all elect (Ostrom's principle 7, the right to
-    organise).
+    """Only some agents may fire: the listed ones, or one that all agents elect.
 
-    In an election each agent's decision is the index of an agent; most votes win, ties are drawn by the
-    game's chance. Agents observe whether they may fire.
+    This is Ostrom's principle 7, the right to organise. In an election each agent decides for the index of an
+    agent. The agent with most votes wins, and chance decides between agents with equally many. Agents observe
+    whether they may fire.
     """
 
     agents: AgentIndices | None = None
     """The agents that may fire; None for an election."""
 
     period_episodes: Positive = 1
-    """An election is held in every such number of episodes, from the first one."""
+    """The number of episodes from one election to the next; the first one is in the first episode."""
 
     override_prob: Share = 0.0
-    """The probability that an authority from outside appoints an agent by chance, all equally likely, in
-    place of the elected one."""
+    """The probability that an outside authority overrides an election and appoints an agent by chance, all
+    equally likely."""
 
     entries: ClassVar[tuple[str, ...]] = ("may fire",)
     at_most: ClassVar[int | None] = 1
@@ -52,31 +58,32 @@ class Sanctioner(Institution):
 
 
 class Arrays(NamedTuple):
-    """Who may fire."""
+    """The agents that may fire."""
 
-    named: Annotated[Bool, "N"]
-    """Whether the agent may fire where none is elected."""
+    listed: Annotated[Bool, "N"]
+    """True for agents that may fire if there is no election."""
     ballot: int
-    """The ballot that elects who may fire; -1 for none."""
+    """The ballot that elects the agent that may fire; -1 for none."""
     may_fire: Annotated[Bool, "B N", DERIVED]
-    """Whether the agent may fire now."""
+    """True for agents that may fire now."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
+    """Return the parameters in `Arrays` by name; without a `Sanctioner` all agents may fire."""
     sanctioner, ballot = next(iter(with_ballots(game, Sanctioner)), (Sanctioner(), -1))
-    named = sanctioner.agents or range(game.agents)
-    return {"named": [agent in named for agent in range(game.agents)], "ballot": ballot}
+    listed = sanctioner.agents or range(game.agents)
+    return {"listed": [agent in listed for agent in range(game.agents)], "ballot": ballot}
 
 
 def appoint(sanctioner: Arrays, ledger: Ledger) -> None:
-    """Write who may fire: the elected agent, or those that the game names."""
+    """Write which agents may fire: the elected one, or those that the game lists."""
     for i in range(sanctioner.may_fire.shape[0]):
         if sanctioner.ballot >= 0:
             sanctioner.may_fire[i] = ledger.in_force[sanctioner.ballot] == i
         else:
-            sanctioner.may_fire[i] = sanctioner.named[i]
+            sanctioner.may_fire[i] = sanctioner.listed[i]
 
 
 def show_may_fire(sanctioner: Arrays, i: int) -> float:
-    """1 if the agent may fire."""
+    """Return what agent i observes of the sanctioner: 1 if it may fire, else 0."""
     return 1.0 if sanctioner.may_fire[i] else 0.0

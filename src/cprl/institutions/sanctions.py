@@ -5,13 +5,14 @@ from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from cprl.institutions.arrays import STATE, STEPS
-from cprl.institutions.base import A_RULE_TO_BREAK, Amount, Institution, with_ballots
+from cprl.institutions.arrays import IN_STATE, STEPS
+from cprl.institutions.institution import A_RULE_TO_BREAK, Amount, Institution, with_ballots
 from cprl.institutions.ledger import SANCTIONS, Ledger
 from cprl.values import Natural, Positive, Where
-from cprl.values.arrays import Bool, Float64, Int32
+from cprl.values.array_types import Bool, Float64, Int32
 
 Offence = Literal["tags", "violations", "both"]
+"""The kinds of offences, see `GraduatedSanctions.on`."""
 Freezes = Annotated[
     tuple[Natural, ...] | tuple[tuple[Natural, ...], ...],
     Where(
@@ -27,27 +28,27 @@ Fines = Annotated[tuple[Amount, ...], Where(len, "one or more numbers >= 0, by l
 
 @dataclass(frozen=True, kw_only=True)
 class GraduatedSanctions(Institution):
-    """Time-outs and fines that grow with an agent's offences and fall back after a while without one
-    (Ostrom's principle 5).
+    """Time-outs and fines that grow with an agent's offences, and shrink again after a time without one.
 
-    An offence is to be tagged by another agent, a detected violation, or either. The first offence is at
-    level 0; each one raises the level of the next. Agents observe their level, 0..1.
+    This is Ostrom's principle 5, graduated sanctions. Being tagged by another agent is an offence, or a
+    detected violation, or both, see `on`. An agent's first offence is punished at level 0, and every offence
+    raises the level for the next one. Agents observe their level, 0..1.
     """
 
     freeze_steps: Freezes = (5, 25, 100, 100)
-    """The turns that an offender misses, by level; the last entry also applies to every higher level. A table
-    has a row for each agent that tags, and is allowed with on="tags" alone. For tags it takes the place of
-    `Rules.freeze_steps`."""
+    """The turns that an offender misses, by level; the last entry also applies to every higher level. For
+    tags this replaces `Rules.freeze_steps`. With on="tags" it can also be a table, with a row for each agent
+    that tags."""
 
     fines: Fines = (0.0, 1.0, 2.0, 4.0)
     """The apples that an offender pays, by level; the last entry also applies to every higher level."""
 
     recovery_steps: Positive | None = 50
-    """After each such number of turns without an offence the level falls by one; None for never."""
+    """The number of turns without an offence after which the level falls by one; None if it never falls."""
 
     on: Offence = "both"
-    """What is an offence: "tags", to be tagged by another agent; "violations" of rules of other institutions,
-    if they are detected; "both"."""
+    """The offences. "tags": an agent is tagged by another one. "violations": it breaks a rule of another
+    institution, and that is detected. "both": either of them."""
 
     entries: ClassVar[tuple[str, ...]] = ("sanction level",)
     at_most: ClassVar[int | None] = 1
@@ -63,7 +64,7 @@ class GraduatedSanctions(Institution):
 
     @property
     def is_table(self) -> bool:
-        """Whether `freeze_steps` has a row for each agent that tags."""
+        """Return whether `freeze_steps` has a row for each agent that tags."""
         return isinstance(self.freeze_steps[0], tuple)
 
     @property
@@ -85,50 +86,51 @@ class GraduatedSanctions(Institution):
 
 
 class Arrays(NamedTuple):
-    """The sanctions of a game, one per index of axis L, of levels, and the level of each agent."""
+    """The sanctions of a game by level, on axis L, and the level of each agent."""
 
     steps: Annotated[Int32, "N L"]
     """The time-out by shooter and level; [N, 0] without `GraduatedSanctions`."""
     fine: Annotated[Float64, "fines"]
-    """By level."""
+    """The fine by level."""
     recovery: int
-    """Turns; 0 for never."""
-    of_tags: bool
-    of_violations: bool
-    level: Annotated[Int32, "B N", STATE]
+    """The turns without an offence after which a level falls; 0 for never."""
+    for_tags: bool
+    for_violations: bool
+    level: Annotated[Int32, "B N", IN_STATE]
     """The level of the next sanction."""
     offence_step: Annotated[Int32, "B N", STEPS]
-    """The step of the last offence, or at which the level last fell."""
+    """The step of the agent's last offence, or of the last fall of its level if that was later."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
+    """Return the parameters in `Arrays` by name."""
     for sanctions, _ in with_ballots(game, GraduatedSanctions):
         levels = np.atleast_2d(sanctions.freeze_steps)
         return {
             "steps": np.broadcast_to(levels, (game.agents, levels.shape[1])),
             "fine": sanctions.fines,
             "recovery": sanctions.recovery_steps or 0,
-            "of_tags": sanctions.on in ("tags", "both"),
-            "of_violations": sanctions.on in ("violations", "both"),
+            "for_tags": sanctions.on != "violations",
+            "for_violations": sanctions.on != "tags",
         }
     steps = np.zeros((game.agents, 0))
-    return {"steps": steps, "fine": (), "recovery": 0, "of_tags": False, "of_violations": False}
+    return {"steps": steps, "fine": (), "recovery": 0, "for_tags": False, "for_violations": False}
 
 
 def forget_offences(sanctions: Arrays) -> None:
-    """Forget the offences of the last episode."""
+    """Clear the levels of all agents when an episode begins."""
     for i in range(sanctions.level.shape[0]):
         sanctions.level[i] = 0
         sanctions.offence_step[i] = 0
 
 
 def time_out(sanctions: Arrays, shooter: int, i: int) -> int:
-    """Return the turns that agent i misses for an offence at its level; `shooter`: who sanctions."""
+    """Return the turns that agent i misses for an offence at its level; `shooter`: who tagged it."""
     return sanctions.steps[shooter, min(sanctions.level[i], sanctions.steps.shape[1] - 1)]
 
 
 def offend(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> None:
-    """Count an offence of agent i, which pays the fine of its level and rises by one."""
+    """Let agent i pay the fine of its level for an offence, and raise its level by one."""
     ledger.fines[i] += sanctions.fine[min(sanctions.level[i], sanctions.fine.shape[0] - 1)]
     sanctions.level[i] += 1
     sanctions.offence_step[i] = turn
@@ -138,9 +140,11 @@ def offend(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> None:
 def sanction_tag(
     sanctions: Arrays, ledger: Ledger, tagged_by: Bool, i: int, turn: int, freeze_steps: int
 ) -> int:
-    """Let agent i pay for being tagged, where that is an offence; return the turns that it misses,
-    `freeze_steps` where it is none."""
-    if not sanctions.of_tags:
+    """Punish agent i for being tagged, if that is an offence, and return the turns that it misses.
+
+    `tagged_by`: bool [N, N]; `freeze_steps`: the turns that it misses if being tagged is no offence.
+    """
+    if not sanctions.for_tags:
         return freeze_steps
     steps = 0
     for j in range(tagged_by.shape[0]):
@@ -151,9 +155,8 @@ def sanction_tag(
 
 
 def sanction_violation(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> int:
-    """Let agent i pay for a detected violation, where that is an offence; return the turns that it
-    misses."""
-    if not sanctions.of_violations:
+    """Punish agent i for a detected violation, if that is an offence, and return the turns that it misses."""
+    if not sanctions.for_violations:
         return 0
     steps = time_out(sanctions, i, i)
     offend(sanctions, ledger, i, turn)
@@ -161,7 +164,7 @@ def sanction_violation(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> 
 
 
 def forgive(sanctions: Arrays, turn: int) -> None:
-    """Lower the level of agents that have had no offence in the last turns, this one included."""
+    """Lower the level of agents whose last offence, or last fall of level, is `recovery` turns ago."""
     if sanctions.recovery > 0:
         for i in range(sanctions.level.shape[0]):
             if sanctions.level[i] > 0 and turn - sanctions.offence_step[i] >= sanctions.recovery:
@@ -170,6 +173,6 @@ def forgive(sanctions: Arrays, turn: int) -> None:
 
 
 def show_level(sanctions: Arrays, i: int) -> float:
-    """Return the agent's level, relative to the last one."""
+    """Return what agent i observes of its level: the level relative to the highest one, 0..1."""
     last = max(1, sanctions.fine.shape[0] - 1, sanctions.steps.shape[1] - 1)
     return min(sanctions.level[i], last) / last

@@ -1,30 +1,31 @@
 """ClosedSeason: times in which nobody may harvest."""
 
 from dataclasses import dataclass
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
-from cprl.institutions.base import Amount, Limit, columns
+from cprl.institutions.institution import Amount, Limit
 from cprl.values import Natural, Positive
-from cprl.values.arrays import Bool, Float64, Int32
+from cprl.values.array_types import Bool, Float64, Int32
 
 
 @dataclass(frozen=True, kw_only=True)
 class ClosedSeason(Limit):
-    """Times in which nobody may harvest (Ostrom's principle 2).
+    """Times in which nobody may harvest.
 
-    Each period of `period_steps` turns, from the first turn of an episode, ends with `closed_steps` turns in
-    which bites are forbidden. Agents observe whether the season is closed, and how long it stays so.
+    This is Ostrom's principle 2, rules that fit local conditions. An episode is divided into periods of
+    `period_steps` turns, and in the last `closed_steps` turns of each period the season is closed. Agents
+    observe whether the season is closed, and how long it stays open or closed.
     """
 
     period_steps: Positive = 100
     """The length of a period in turns."""
 
     closed_steps: Natural = 25
-    """The last turns of each period, in which the season is closed: 0 to `period_steps`."""
+    """The number of turns at the end of each period in which the season is closed: 0 to `period_steps`."""
 
     fine: Amount | None = None
-    """None: nobody can harvest in a closed season. A number: it can be done, is a violation, and each bite
-    costs so many apples if it is detected."""
+    """The fine in apples for each harvest in a closed season, which is a violation, if it is detected. None
+    makes such harvests impossible."""
 
     counts: ClassVar[tuple[str, ...]] = ("closed_bites",)
     entries: ClassVar[tuple[str, ...]] = ("season closed", "season time")
@@ -39,7 +40,7 @@ class ClosedSeason(Limit):
 
 
 class Arrays(NamedTuple):
-    """All closed seasons of a game, one per index of axis S."""
+    """The parameters of all `ClosedSeason` of a game, one of them per index of axis S."""
 
     period_steps: Annotated[Int32, "S"]
     closed_steps: Annotated[Int32, "S"]
@@ -47,19 +48,20 @@ class Arrays(NamedTuple):
     fine: Annotated[Float64, "S"]
 
 
-def parameters(game: Any) -> dict[str, Any]:
-    return columns(ClosedSeason, Arrays, game)
-
-
 def is_season_closed(seasons: Arrays, s: int, turn: int) -> bool:
-    """Return whether a season is closed in a turn, counted from 1."""
+    """Return whether season s is closed in a turn, counted from 1."""
     return (turn - 1) % seasons.period_steps[s] >= seasons.period_steps[s] - seasons.closed_steps[s]
 
 
 def show_season(seasons: Arrays, what: int, s: int, turn: int) -> float:
-    """1 if the coming turn is closed; the part of a period until that changes."""
+    """Return what agents observe of season s after a turn, 0..1.
+
+    Entry 0 is 1 if the season is closed in the coming turn; entry 1 is the time until that changes, in
+    periods. `what`: the index of the entry.
+    """
     if what == 0:
         return 1.0 if is_season_closed(seasons, s, turn + 1) else 0.0
-    period, within = seasons.period_steps[s], turn % seasons.period_steps[s]
+    period = seasons.period_steps[s]
+    within = turn % period
     open_steps = period - seasons.closed_steps[s]
     return ((open_steps if within < open_steps else period) - within) / period

@@ -1,15 +1,15 @@
-"""Taxes on the harvest, and levies of nested groups."""
+"""Tax on the harvest, and Levies, by which nested groups share a part of it."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from cprl.institutions.arrays import STATE
-from cprl.institutions.base import Amount, Institution, check_agent_indices, with_ballots
+from cprl.institutions.arrays import IN_STATE
+from cprl.institutions.institution import Amount, Institution, check_agent_indices, with_ballots
 from cprl.institutions.ledger import Ledger
 from cprl.values import Natural, Positive, Share, Where
-from cprl.values.arrays import Float64, Int32
+from cprl.values.array_types import Float64, Int32
 
 Redistribution = Literal["equal", "none"]
 Brackets = Annotated[
@@ -19,7 +19,7 @@ Brackets = Annotated[
         "(apples, rate) pairs, ascending from 0 apples, rates in 0..1",
     ),
 ]
-Groups = Annotated[
+_Groups = Annotated[
     tuple[tuple[Natural, ...], ...],
     Where(lambda groups: groups and all(groups), "a tuple of agent indices for each group"),
 ]
@@ -29,44 +29,43 @@ Groups = Annotated[
 class Tax(Institution):
     """A tax on the harvest, collected at the end of every period and at the end of the episode.
 
-    The base is the apples harvested in the period, before all fines and other taxes, so several taxes are
-    independent of their order. What is collected counts as a fine, what is paid out as a transfer. Agents
-    observe nothing of a fixed tax.
+    The tax is a share of the apples that an agent harvested in the period, before all fines and other taxes;
+    so the order of several taxes does not matter. Collected apples count as fines, and apples that are paid
+    out as transfers. Agents observe nothing of a tax, unless they vote on it.
     """
 
     rate: Share = 0.1
-    """The share of the harvest that is taken where there are no brackets."""
+    """The share of the harvest that is taken; unused with `brackets`."""
 
     redistribution: Redistribution = "equal"
-    """"equal": what was collected is paid out in equal parts to all agents at once; "none": it is lost."""
+    """"equal": all agents receive the collected apples at once, in equal parts. "none": they are lost."""
 
     period_steps: Positive = 1
     """The length of a period in turns."""
 
     brackets: Brackets = ()
-    """(apples, rate) pairs in ascending order, the first from 0: of the apples of a period, those from here
-    up to the next bracket are taxed at this rate. Empty for `rate` alone."""
+    """(apples, rate) pairs in ascending order, the first from 0 apples: the part of a period's harvest
+    between the apples of a bracket and those of the next one is taxed at this rate. Empty for one `rate`."""
 
     voted_on: ClassVar[str] = "the tax rate"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Levies(Institution):
-    """Groups within the group, each of which shares a part of its harvest, beside a part that all share
-    (Ostrom's principle 8, nested enterprises).
+    """Agents share one part of their harvest within their group, and another part with all agents.
 
-    Every turn `local_rate` of each harvest is divided equally within the agent's group, and `joint_rate` of
-    it equally among all agents.
+    This is Ostrom's principle 8, nested enterprises. In every turn the share `local_rate` of each harvest is
+    divided equally within the agent's group, and the share `joint_rate` equally among all agents.
     """
 
-    groups: Groups
+    groups: _Groups
     """The agent indices of each group; each agent is in exactly one."""
 
     local_rate: Share = 0.2
-    """The share of the harvest that stays within the group."""
+    """The share of the harvest that is divided within the group."""
 
     joint_rate: Share = 0.1
-    """The share of the harvest that goes to all; both rates together are at most 1."""
+    """The share of the harvest that is divided among all agents; both rates together are at most 1."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -77,40 +76,45 @@ class Levies(Institution):
             )
 
     def check(self, game: Any) -> None:
-        members = sorted(agent for group in self.groups for agent in group)
-        check_agent_indices("Levies.groups", members, game.agents)
-        if members != list(range(game.agents)):
+        agents = sorted(agent for group in self.groups for agent in group)
+        check_agent_indices("Levies.groups", agents, game.agents)
+        if agents != list(range(game.agents)):
             raise ValueError(
-                f"Levies.groups has the agents {members}; allowed: each of 0 to {game.agents - 1} exactly "
-                "once"
+                f"Levies.groups has the agents {agents}; allowed: each of 0 to {game.agents - 1} exactly once"
             )
 
     @property
     def group_of(self) -> tuple[int, ...]:
-        """The index of each agent's group: [N]."""
-        by_agent = {agent: number for number, group in enumerate(self.groups) for agent in group}
-        return tuple(by_agent[agent] for agent in sorted(by_agent))
+        """Return the index of each agent's group, one entry per agent."""
+        group_by_agent = {agent: index for index, group in enumerate(self.groups) for agent in group}
+        return tuple(group_by_agent[agent] for agent in sorted(group_by_agent))
 
 
 class Arrays(NamedTuple):
-    """All taxes and levies of a game, one per index of axis T; levies are two taxes."""
+    """The parameters and memory of all taxes of a game, one per index of axis T.
+
+    A `Levies` counts as two taxes: one is paid out within groups, the other among all agents.
+    """
 
     from_: Annotated[Float64, "T bounds"]
-    """Where each bracket begins, and then where the last one ends; infinite for those that a tax lacks."""
+    """The apples at which each bracket begins, with the end of the last bracket as a last entry; infinite for
+    brackets that a tax lacks."""
     rate: Annotated[Float64, "T brackets"]
     ballot: Annotated[Int32, "T"]
     """The ballot that decides the rate; -1 for none."""
     steps: Annotated[Int32, "T"]
-    """Turns per period."""
+    """The number of turns in a period."""
     group: Annotated[Int32, "T N"]
-    """The group within which it is paid out; -1 where it is lost."""
-    income: Annotated[Float64, "B T N", STATE]
-    """Apples harvested in the current period."""
+    """The index of the group within which the tax of each agent is paid out; -1 for a tax that is lost."""
+    income: Annotated[Float64, "B T N", IN_STATE]
+    """The apples that each agent has harvested in the current period."""
     owed: Annotated[Float64, "B N"]
     """The tax that each agent owes."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
+    """Return the parameters in `Arrays` by name."""
+    # one row per tax: ballot, period, group of each agent, brackets
     rows: list[tuple[int, int, tuple[int, ...], tuple[tuple[float, float], ...]]] = []
     for tax, ballot in with_ballots(game, Tax):
         group = (0 if tax.redistribution == "equal" else -1,) * game.agents
@@ -118,30 +122,31 @@ def parameters(game: Any) -> dict[str, Any]:
     for levies, _ in with_ballots(game, Levies):
         rows.append((-1, 1, levies.group_of, ((0.0, levies.local_rate),)))
         rows.append((-1, 1, (0,) * game.agents, ((0.0, levies.joint_rate),)))
-    most = max((len(brackets) for *_, brackets in rows), default=1)
-    from_, rate = np.full((len(rows), most + 1), np.inf), np.zeros((len(rows), most))
-    for tax_number, (*_, brackets) in enumerate(rows):
-        from_[tax_number, : len(brackets)], rate[tax_number, : len(brackets)] = np.transpose(brackets)
+    most_brackets = max((len(brackets) for *_, brackets in rows), default=1)
+    from_ = np.full((len(rows), most_brackets + 1), np.inf)
+    rate = np.zeros((len(rows), most_brackets))
+    for row, (*_, brackets) in enumerate(rows):
+        from_[row, : len(brackets)], rate[row, : len(brackets)] = np.transpose(brackets)
     ballots, steps, groups, _ = zip(*rows, strict=True) if rows else ((), (), (), ())
     group_of = np.reshape(groups, (-1, game.agents))
     return {"from_": from_, "rate": rate, "ballot": ballots, "steps": steps, "group": group_of}
 
 
 def forget_income(taxes: Arrays) -> None:
-    """Forget the harvests of the last episode."""
+    """Clear the harvests that taxes remember when an episode begins."""
     for tax in range(taxes.income.shape[0]):
         for i in range(taxes.income.shape[1]):
             taxes.income[tax, i] = 0.0
 
 
 def note_income(taxes: Arrays, i: int) -> None:
-    """Note a harvest of agent i."""
+    """Count a harvest of agent i for all taxes."""
     for tax in range(taxes.steps.shape[0]):
         taxes.income[tax, i] += 1.0
 
 
 def collect_taxes(taxes: Arrays, ledger: Ledger, turn: int, is_over: bool) -> None:
-    """Collect and pay out the taxes whose period ends with this turn, or with the episode."""
+    """Collect and pay out the taxes whose period ends with this turn; `is_over`: the episode ends with it."""
     agents = ledger.fines.shape[0]
     for tax in range(taxes.steps.shape[0]):
         if (is_over or turn % taxes.steps[tax] == 0) and has_income(taxes, tax):
@@ -163,8 +168,9 @@ def has_income(taxes: Arrays, tax: int) -> bool:
 
 
 def tax_of(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> float:
-    """Return the apples that agent i owes on its harvest of the period."""
-    income, owed = taxes.income[tax, i], 0.0
+    """Return the apples of a tax that agent i owes for its harvest in the period."""
+    income = taxes.income[tax, i]
+    owed = 0.0
     if taxes.ballot[tax] >= 0:
         return ledger.in_force[taxes.ballot[tax]] * income
     for bracket in range(taxes.rate.shape[1]):
@@ -176,8 +182,9 @@ def tax_of(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> float:
 
 
 def pay_out(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> None:
-    """Give agent i its equal part of what its group owed."""
-    pool, members = 0.0, 0
+    """Give agent i its equal part of the tax that the members of its group owed."""
+    pool = 0.0
+    members = 0
     for j in range(ledger.fines.shape[0]):
         if taxes.group[tax, j] == taxes.group[tax, i]:
             pool += taxes.owed[j]

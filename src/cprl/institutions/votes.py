@@ -1,16 +1,16 @@
-"""Vote: agents decide on a tax or a quota; and how ballots of all institutions are held."""
+"""Vote: agents decide on a tax or a quota. The rules here hold the ballots of all institutions."""
 
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from cprl.institutions.base import MOST_APPLES, Amount, Ballot, Institution, threshold
+from cprl.institutions.institution import MOST_APPLES, Amount, Ballot, Institution, threshold
 from cprl.institutions.ledger import Ledger
 from cprl.institutions.quotas import Quota
 from cprl.institutions.taxes import Tax
 from cprl.values import Positive, Share, Where
-from cprl.values.arrays import Bool, Float64, Int32, Int64
+from cprl.values.array_types import Bool, Float64, Int32, Int64
 
 MOST_DECISIONS: Final = 2**20
 """The largest number of options that an agent chooses from."""
@@ -26,36 +26,35 @@ Choices = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class Vote(Institution):
-    """Agents vote on the rate of a tax or the share of a quota (Ostrom's principle 3, collective choice).
+    """Agents vote on the rate of a tax or on the share of a quota.
 
-    Each agent's decision is the index of a choice; the median of the N decisions counts, of two middle ones
-    the lower. Agents observe the value in force.
+    This is Ostrom's principle 3, collective choice. Each agent decides for the index of a choice, and the
+    median of the N decisions is put in force; of two middle ones it is the lower. Agents observe the value in
+    force.
     """
 
     on: Tax | Quota
-    """The institution whose `rate` or `share` is voted on; its own value is not used."""
+    """The institution whose `rate` or `share` is voted on; the value that it has here is not used."""
 
     choices: Choices = (0.0, 0.25, 0.5, 0.75, 1.0)
-    """The values to choose from, ascending, at least two; of a tax 0..1."""
+    """The values to choose from, at least two, in ascending order; for a tax in 0..1."""
 
     period_episodes: Positive = 1
-    """A vote is held in every such number of episodes, from the first one; its result stays in force until
-    the next."""
+    """The number of episodes from one vote to the next. The first vote is in the first episode, and a result
+    stays in force until the next vote."""
 
     override_prob: Share = 0.0
-    """The probability that an authority from outside puts a choice in force by chance, all equally likely, in
-    place of the result of a vote (the opposite of Ostrom's principle 7, the right to organise)."""
+    """The probability that an outside authority overrides a vote and puts a choice in force by chance, all
+    equally likely. This is the opposite of Ostrom's principle 7, the right to organise."""
 
     entries: ClassVar[tuple[str, ...]] = ("in force",)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.on, Tax) and (self.on.brackets or self.choices[-1] > 1):
-            raise ValueError(
-                "Vote.on is a Tax with brackets; allowed: a Tax with one rate"
-                if self.on.brackets
-                else f"Vote.choices has {self.choices[-1]:g}; allowed for a Tax: 0..1"
-            )
+        if isinstance(self.on, Tax) and self.on.brackets:
+            raise ValueError("Vote.on is a Tax with brackets; allowed: a Tax with one rate")
+        if isinstance(self.on, Tax) and self.choices[-1] > 1:
+            raise ValueError(f"Vote.choices has {self.choices[-1]:g}; allowed for a Tax: 0..1")
 
     @property
     def rule(self) -> Institution:
@@ -73,23 +72,25 @@ class Vote(Institution):
 
 
 class Arrays(NamedTuple):
-    """All ballots of a game, one per index of axis V."""
+    """The parameters of all ballots of a game, one of them per index of axis V."""
 
     options: Annotated[Int32, "V"]
     """The number of choices."""
     choices: Annotated[Float64, "V choices"]
     is_election: Annotated[Bool, "V"]
     episodes: Annotated[Int32, "V"]
-    """Held in every such number of episodes."""
+    """The number of episodes from one time that the ballot is held to the next."""
     override: Annotated[Int64, "V"]
-    """Overridden if a uniform 32-bit word is below this threshold."""
+    """The result is overridden if a uniform 32-bit word is below this threshold."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
+    """Return the parameters in `Arrays` by name."""
     ballots = game.ballots
-    choices = np.zeros((len(ballots), max((len(ballot.choices) for ballot in ballots), default=1)))
-    for number, ballot in enumerate(ballots):
-        choices[number, : len(ballot.choices)] = ballot.choices
+    most_choices = max((len(ballot.choices) for ballot in ballots), default=1)
+    choices = np.zeros((len(ballots), most_choices))
+    for index, ballot in enumerate(ballots):
+        choices[index, : len(ballot.choices)] = ballot.choices
     return {
         "options": [len(ballot.choices) for ballot in ballots],
         "choices": choices,
@@ -105,14 +106,14 @@ def is_due(ballots: Arrays, ballot: int, episode: int) -> bool:
 
 
 def choice_of(ballots: Arrays, ballot: int, decision: int) -> int:
-    """Return the choice that a decision makes on a ballot; see `cprl.Game.ballots`."""
+    """Return the index of the choice that a decision makes on a ballot; see `cprl.Game.ballots`."""
     for before in range(ballot):
         decision //= ballots.options[before]
     return decision % ballots.options[ballot]
 
 
 def votes_for(ballots: Arrays, ballot: int, decisions: Int64, choice: int) -> int:
-    """Return the number of agents whose decision makes this choice; `decisions`: int64 [N]."""
+    """Return the number of agents that decide for a choice on a ballot; `decisions`: int64 [N]."""
     votes = 0
     for i in range(decisions.shape[0]):
         votes += choice_of(ballots, ballot, decisions[i]) == choice
@@ -120,8 +121,9 @@ def votes_for(ballots: Arrays, ballot: int, decisions: Int64, choice: int) -> in
 
 
 def median_choice(ballots: Arrays, ballot: int, decisions: Int64) -> int:
-    """Return the median of the N choices, of two middle ones the lower."""
-    votes, choice = votes_for(ballots, ballot, decisions, 0), 0
+    """Return the index of the median of the N agents' choices; of two middle ones the lower."""
+    choice = 0
+    votes = votes_for(ballots, ballot, decisions, choice)
     while 2 * votes < decisions.shape[0]:
         choice += 1
         votes += votes_for(ballots, ballot, decisions, choice)
@@ -129,12 +131,14 @@ def median_choice(ballots: Arrays, ballot: int, decisions: Int64) -> int:
 
 
 def elected_choice(ballots: Arrays, ballot: int, decisions: Int64, word: np.uint64) -> int:
-    """Return the choice with most votes; a uniform 32-bit word decides among those with equally many."""
-    most, tied = 0, 0
+    """Return the index of the choice with most votes; a uniform 32-bit word decides between equal ones."""
+    most = 0
+    tied = 0
     for choice in range(ballots.options[ballot]):
         votes = votes_for(ballots, ballot, decisions, choice)
         if votes > most:
-            most, tied = votes, 1
+            most = votes
+            tied = 1
         elif votes == most:
             tied += 1
     ties_left = np.int64(word % np.uint64(tied))
@@ -153,7 +157,10 @@ def hold_ballot(
     decisions: Int64,
     words: tuple[np.uint64, np.uint64, np.uint64, np.uint64],
 ) -> None:
-    """Put the result of a ballot in force: what agents decided, or what the authority from outside draws."""
+    """Put the result of a ballot in force: the agents' decision, or a choice drawn by an outside authority.
+
+    `decisions`: int64 [N]; `words`: uniform random 32-bit words.
+    """
     if np.int64(words[0]) < ballots.override[ballot]:
         choice = np.int64(words[1] % np.uint64(ballots.options[ballot]))
     elif ballots.is_election[ballot]:
@@ -164,5 +171,5 @@ def hold_ballot(
 
 
 def show_in_force(ballots: Arrays, ledger: Ledger, ballot: int) -> float:
-    """Return the value in force, relative to the highest choice."""
+    """Return what agents observe of a ballot: the value in force, relative to the highest choice."""
     return ledger.in_force[ballot] / ballots.choices[ballot, ballots.options[ballot] - 1]

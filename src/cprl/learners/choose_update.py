@@ -1,4 +1,5 @@
-"""How the lanes of a loss are updated, where its algorithm does not say, or is not of cprl."""
+"""Choose how the lanes of a user's loss are updated: all together if that is possible, else one after the
+other."""
 
 import warnings
 from collections.abc import Callable, Sequence
@@ -14,8 +15,9 @@ from cprl.learners.optimizers import UpdateRule
 from cprl.learners.refusals import check_loss
 
 _TRIAL_LANES: Final = 2
-"""Networks that are tried: what torch does not vmap it refuses for two."""
+"""The number of lanes in a trial update; what torch cannot vmap fails for two lanes too."""
 _TRIAL_RULE: Final = UpdateRule(learning_rate=0.1)
+"""The optimiser of a trial update."""
 
 
 def choose_update(
@@ -23,38 +25,46 @@ def choose_update(
     make_loss: MakeLoss,
     example: Callable[[int], TensorDict],
     *,
-    said: Update | None = None,
+    declared: Update | None = None,
     sharing: int = 1,
 ) -> Update:
-    """Return how the lanes of a loss are updated: as is said, or "vmapped", if torch vmaps the loss and it
-    keeps nothing of a call, else "list", with a warning.
+    """Return how the lanes of a loss are updated.
 
-    A loss is never "stacked" unless its algorithm says so: over one batch of all lanes it may mix them, and a
-    comparison on an example would not show what depends on the numbers of a batch.
+    That is as declared, if the algorithm declares it. Else it is "vmapped", if torch can vmap the loss and
+    the loss keeps no state between calls; or "list", with a warning.
+
+    A loss is never "stacked" without a declaration. A stacked loss gets one batch of all lanes and may mix
+    them, and a trial would not show a mixture that depends on the numbers of a batch.
 
     Args:
-        example: makes a batch of so many lanes, [L, b], as the loss will read it.
+        networks: the networks of the lanes.
+        make_loss: makes the loss of a network.
+        example: makes a synthetic batch of a number of lanes, [L, b], in the shapes that the loss will read.
+        declared: the update that the algorithm declares; None for none.
+        sharing: the number of lanes that share a network.
 
     Raises:
-        ValueError: if the loss is refused, see `check_loss`, or is said to be updated for all lanes at once
-            and keeps something, which lanes would share.
+        ValueError: if the loss is refused, see `check_loss`; or if it keeps state that lanes would share, and
+            is declared to be updated for all lanes at once.
     """
-    kept = ", ".join(check_loss(make_loss(deepcopy(networks[0])), example(1)[0]))
-    if said is not None:
-        if kept and said != "list":
+    loss_state = ", ".join(check_loss(make_loss(deepcopy(networks[0])), example(1)[0]))
+    if declared is not None:
+        if loss_state and declared != "list":
             raise ValueError(
-                f'update is "{said}", and agents would share what the loss keeps of a call: {kept}; allowed: '
-                'update = "list", or none'
+                f'update is "{declared}", and agents would share what the loss keeps of a call: '
+                f'{loss_state}; allowed: update = "list", or none'
             )
-        return said
-    reason = f"agents would share what the loss keeps of a call: {kept}"
-    if not kept:
-        tried = networks[:_TRIAL_LANES]
-        batch = example(len(tried) * sharing)
+        return declared
+    reason = f"agents would share what the loss keeps of a call: {loss_state}"
+    if not loss_state:
+        trial_networks = networks[:_TRIAL_LANES]
+        batch = example(len(trial_networks) * sharing)
         try:
-            lanes = LaneNetworks(tried, make_loss, _TRIAL_RULE, update="vmapped", sharing=sharing)
-            for _ in range(2):  # what the first step leaves may break the second
-                lanes.learn(Draw.of(batch.clone()))
+            lane_networks = LaneNetworks(
+                trial_networks, make_loss, _TRIAL_RULE, update="vmapped", sharing=sharing
+            )
+            for _ in range(2):  # the first step may leave something that breaks the second
+                lane_networks.learn(Draw.of(batch.clone()))
             return "vmapped"
         except Exception as error:  # a user's loss may raise anything
             reason = (str(error) or repr(error)).splitlines()[0]

@@ -1,4 +1,7 @@
-"""Draw: a batch to learn from that is not yet gathered."""
+"""Draw: a batch to learn from that is not gathered yet.
+
+An update gathers its batch itself, so that torch compiles both as one and writes no batch to memory.
+"""
 
 from collections.abc import Hashable, Sequence
 from typing import Any, NamedTuple
@@ -9,30 +12,37 @@ from torch import Tensor
 
 
 class Draw(NamedTuple):
-    """A batch to learn from, which the step itself gathers, so that both are compiled as one."""
+    """A batch to learn from as the tensors and the function that make it."""
 
     gather: Any
-    """A function of the columns that makes the batch, [L, b] or sequences [L, .., T]; hashable, since code is
-    compiled for it."""
+    """A function of `columns` that makes the batch, [L, b], or sequences [L, .., T]; hashable, because code
+    is compiled for each such function."""
     columns: list[Tensor]
+    """The tensors from which the batch is gathered."""
     form: Hashable
-    """The shapes and dtypes of the columns."""
+    """The shapes and dtypes of the columns, for which code is compiled too."""
 
     @classmethod
-    def of(cls, batch: TensorDict, *place: Tensor) -> "Draw":
-        """A draw of a whole batch that exists, [L, n], or of places [L, ...] of it."""
+    def of(cls, batch: TensorDict, *index: Tensor) -> "Draw":
+        """Return the draw of a whole batch that exists, [L, n], or of some of its places.
+
+        Args:
+            index: the places of each lane, int64 [L, ...]; none for the whole batch.
+        """
         entries = sorted(batch.items(True, True), key=lambda entry: str(entry[0]))
-        columns = [*(column for _, column in entries), *place]
-        gather = _OfBatch(tuple(name for name, _ in entries), tuple(batch.batch_size))
+        columns = [*(column for _, column in entries), *index]
+        gather = _PackedBatch(tuple(name for name, _ in entries), tuple(batch.batch_size))
         return cls(gather, columns, tuple((column.shape, column.dtype) for column in columns))
 
 
-class _OfBatch(NamedTuple):
-    """Puts a batch together again: the names of its entries, and its batch size [L, n]. It takes places
-    [L, ...] of it, if they are a last column."""
+class _PackedBatch(NamedTuple):
+    """A function that makes a batch of its columns again, or of some of its places, if these are a last
+    column."""
 
     names: tuple[Any, ...]
+    """The names of the entries, in the order of their columns."""
     size: tuple[int, ...]
+    """The batch size [L, n]."""
 
     def __call__(self, columns: Sequence[Tensor]) -> TensorDict:
         batch = TensorDict({}, batch_size=self.size)
@@ -40,7 +50,6 @@ class _OfBatch(NamedTuple):
             batch.set(name, column)
         if len(columns) == len(self.names):
             return batch
-        place = columns[-1]
-        lane = torch.arange(len(place), device=place.device).view(-1, *[1] * (place.ndim - 1))
-        taken: TensorDict = batch[lane, place]
-        return taken
+        index = columns[-1]
+        lane = torch.arange(len(index), device=index.device).view(-1, *[1] * (index.ndim - 1))
+        return batch[lane, index]

@@ -1,4 +1,8 @@
-"""Lanes: who learns apart. A lane is one agent of one replica, or the team of a replica."""
+"""Lanes: the units that learn independently of each other, and how a turn is split into them.
+
+A lane is one agent of one replica, or, if the agents of a replica are a team, that team. All lanes are
+updated together, but none influences another.
+"""
 
 from collections.abc import Mapping
 from dataclasses import KW_ONLY, dataclass, field
@@ -11,21 +15,22 @@ from torch import Tensor
 from cprl import recurrent_state
 from cprl.commons.spaces import Spaces
 from cprl.keys import Turn
-from cprl.learners.transitions import LaneTurn, TransitionForm, by_lane, joint_actions, lane_turn
+from cprl.learners.transitions import LaneTurn, TransitionForm, joint_actions_by_agent, lane_turn
 from cprl.objectives.rewards import Reward, check_reward
 from cprl.policies.rng import Purpose, lane_names, lane_seeds
 from cprl.values import Natural, Range, Value
 
 StartFrom: TypeAlias = Mapping[str, Mapping[str, Tensor]]
-"""The state dict of the acting network with which each agent starts, by the agent's name."""
+"""State dicts of acting networks by the name of the agent that starts with them, see `Lanes.names`."""
 
 
 @dataclass(frozen=True)
 class Lanes(Value, stored=False):
-    """Who learns: S agents of each of R replicas, in W worlds; what they want, and what they start from.
+    """The S agents of each of R replicas that learn by one algorithm, with their reward and initial weights.
 
-    There are L = R x S lanes, or, where a lane is a team of S agents, L = R, in order of replicas. Members of
-    a team have the seeds of initial weights and exploration that they would have as independent agents.
+    There are L = R x S lanes, lane = replica x S + position of the agent in `agents`; or, if the agents of
+    a replica are a team, L = R. Each replica plays in W worlds. Members of a team have the same seeds of
+    initial weights and exploration as independent agents.
     """
 
     spaces: Spaces
@@ -42,24 +47,25 @@ class Lanes(Value, stored=False):
     first_replica: int = 0
     """The index of the first replica, so that replica r can be trained alone."""
     reward: Reward = "individual"
-    """What they want, see `cprl.objectives.rewards`."""
+    """The reward that the agents learn from, see `cprl.objectives.rewards`."""
     start_from: StartFrom = field(default_factory=dict)
-    """The weights with which acting networks, and their targets, start, by the agent's name; the others, such
-    as critics, are new."""
+    """The initial weights of acting networks and their targets, by the agent's name; agents that are not
+    named, and all other networks, such as critics, start with new weights."""
     share_parameters: bool = False
-    """Whether the agents of a replica share one network, which learns from all of them."""
+    """True if the agents of a replica share one network, which learns from all of them."""
     are_teams: bool = False
-    """Whether the agents of a replica are one lane."""
+    """True if the agents of a replica are one lane."""
     device: str | torch.device = "cpu"
     """The torch device of networks, stored turns and updates."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        agents, everyone = self.agents, self.spaces.agents
+        everyone = self.spaces.agents
         check_reward("reward", self.reward, everyone)
-        if not agents or len(set(agents)) < len(agents) or not set(agents) <= set(range(everyone)):
+        known = set(self.agents) & set(range(everyone))
+        if not self.agents or len(known) < len(self.agents):
             raise ValueError(
-                f"agents is {agents}; allowed: one or more of the agents 0 to {everyone - 1}, each once"
+                f"agents is {self.agents}; allowed: one or more of the agents 0 to {everyone - 1}, each once"
             )
 
     def __len__(self) -> int:
@@ -67,96 +73,113 @@ class Lanes(Value, stored=False):
 
     @property
     def members(self) -> tuple[int, ...]:
-        """The axes of the members of a lane: (S,) of a team, () of one agent."""
+        """Return the shape of a lane's axis of members: (S,) for a team, () for one agent."""
         return (len(self.agents),) if self.are_teams else ()
 
     @property
     def sharing(self) -> int:
-        """How many consecutive lanes share a network; members of teams share within theirs."""
+        """Return the number of consecutive lanes that share a network; 1 for teams, whose members share
+        inside their lane."""
         return len(self.agents) if self.share_parameters and not self.are_teams else 1
 
     @property
     def names(self) -> list[str]:
-        """The name of each agent's networks, see `lane_names`."""
-        return lane_names(replicas=self._numbers, agents=self.agents)
+        """Return the names of the agents of all replicas, e.g. "replica_0/agent_0", see `lane_names`."""
+        return lane_names(replicas=self._replica_indices, agents=self.agents)
 
     def agent_seeds(self, purpose: Purpose) -> list[tuple[int, ...]]:
-        """The seed of each agent of each replica, see `lane_seeds`."""
-        return lane_seeds(self.seed, replicas=self._numbers, agents=self.agents, purpose=purpose)
+        """Return the seed of each agent of each replica for one purpose, see `lane_seeds`."""
+        return lane_seeds(self.seed, replicas=self._replica_indices, agents=self.agents, purpose=purpose)
 
     def seeds(self, purpose: Purpose) -> list[tuple[int, ...]]:
-        """The seed of each lane; that of a team is its first member's."""
+        """Return the seed of each lane for one purpose; a team has the seed of its first member."""
         return self.agent_seeds(purpose)[:: prod(self.members)]
 
     @property
-    def _numbers(self) -> range:
+    def _replica_indices(self) -> range:
         return range(self.first_replica, self.first_replica + self.replicas)
 
-    def form(self, **more: Any) -> TransitionForm:
-        """What lanes store of a turn: of each member its action and its reward, unless `more` says other."""
+    def form(self, **options: Any) -> TransitionForm:
+        """Return the shapes of what lanes store of a turn.
+
+        Args:
+            options: fields of the `TransitionForm`. Unless they say otherwise, each member's own action and
+                reward are stored.
+        """
         return TransitionForm(
             observation_shape=(*self.members, *self.spaces.observation_shape),
             observation_dtype=self.spaces.observation_dtype,
-            **{"action_shape": self.members, "reward_shape": self.members, **more},
+            **{"action_shape": self.members, "reward_shape": self.members, **options},
         )
 
     def turn(self, turn: Turn, rewards: Any, form: TransitionForm) -> LaneTurn:
-        """One transition of every lane in each of its worlds, C = L x W columns; see `lane_turn`.
+        """Return one transition of every lane in each of its worlds, C = L x W columns; see `lane_turn`.
 
         Args:
-            rewards: of all agents, [B, N]; those of a team that shares its reward all the same.
-            form: what of it is stored.
+            turn: one turn of all worlds.
+            rewards: the shaped rewards of all agents, [B, N]; equal for all agents under the team reward.
+            form: the shapes of what is stored.
         """
-        lanes = lane_turn(self.agents, turn, rewards, are_team=self.are_teams)
-        if self.are_teams and not form.reward_shape:
-            lanes = lanes._replace(reward=lanes.reward[:, 0])
-        if form.action_shape != self.members:
-            lanes = lanes._replace(action=joint_actions(self.agents, turn))
+        transitions = lane_turn(self.agents, turn, rewards, are_team=self.are_teams)
+        if self.are_teams and not form.reward_shape:  # all members get the same: one number is enough
+            transitions = transitions._replace(reward=transitions.reward[:, 0])
+        if form.action_shape != self.members:  # the actions of all agents of the game, see `OffPolicy`
+            transitions = transitions._replace(action=joint_actions_by_agent(self.agents, turn))
         if form.state_cells:
-            before = self.states(turn, recurrent_state.BEFORE, form.state_cells)
-            after = self.states(turn, recurrent_state.AFTER, form.state_cells)
-            lanes = lanes._replace(recurrent_state=before, next_recurrent_state=after)
+            states_before = self.states(turn, recurrent_state.BEFORE, form.state_cells)
+            states_after = self.states(turn, recurrent_state.AFTER, form.state_cells)
+            transitions = transitions._replace(
+                recurrent_state=states_before, next_recurrent_state=states_after
+            )
         if form.has_in_play:
             in_play = turn.agents["in_play"][:, list(self.agents)]
-            lanes = lanes._replace(in_play=in_play.reshape(-1, *self.members))
-        return lanes
+            transitions = transitions._replace(in_play=in_play.reshape(-1, *self.members))
+        return transitions
 
     def states(self, turn: Turn, name: str, cells: int) -> Any:
-        """The states of recurrent networks in a turn, float32 [C, K], of teams [C, S, K]; an array as those
-        of a `LaneTurn`.
+        """Return the states of recurrent networks in a turn, float32 [C, K], or [C, S, K] of teams, in the
+        order of the fields of a `LaneTurn`.
 
         Args:
-            name: `recurrent_state.BEFORE` or `AFTER`.
+            name: `recurrent_state.BEFORE` or `recurrent_state.AFTER`.
             cells: the numbers K of a state.
         """
-        states = recurrent_state.read(turn.agents, (slice(None), list(self.agents)), cells, name)
+        states = recurrent_state.read_states(turn.agents, (slice(None), list(self.agents)), cells, name)
         return states.reshape(-1, *self.members, cells)
 
-    def seen_next(self, turn: Turn) -> Tensor:
-        """The observations of lanes after a turn, [L, W, *observation_shape]."""
-        seen = torch.as_tensor(turn.next_agents["observation"])[:, list(self.agents)]
-        return self.by_lane(seen.reshape(-1, *self.members, *self.spaces.observation_shape))
+    def next_observations(self, turn: Turn) -> Tensor:
+        """Return what lanes observe after a turn, [L, W, *observation_shape], or [L, W, S, ...] of teams."""
+        observation = torch.as_tensor(turn.next_agents["observation"])[:, list(self.agents)]
+        return self.by_lane(observation.reshape(-1, *self.members, *self.spaces.observation_shape))
 
     @property
     def columns(self) -> Tensor:
-        """Where the worlds of each lane stand in a `LaneTurn`, int64 [L, W]."""
+        """Return the columns of a `LaneTurn` that hold the worlds of each lane, int64 [L, W]."""
         return self.by_lane(torch.arange(len(self) * self.worlds))
 
     def by_lane(self, columns: Any) -> Tensor:
-        """A field of a `LaneTurn`, [C, ...], as one of lanes and their worlds, [L, W, ...]."""
-        return by_lane(torch.as_tensor(columns), replicas=self.replicas, worlds=self.worlds)
+        """Reshape a field of a `LaneTurn`, [C, ...], to lanes and their worlds, [L, W, ...].
+
+        Columns are ordered by the B = R x W worlds, and within a world by its lanes: its agents in the order
+        of `agents`, or its one team.
+        """
+        values = torch.as_tensor(columns)
+        if self.worlds == 1:
+            return values[:, None]
+        by_world = values.reshape(self.replicas, self.worlds, -1, *values.shape[1:])
+        return by_world.swapaxes(1, 2).reshape(-1, self.worlds, *values.shape[1:])
 
     def by_world(self, values: Tensor) -> Tensor:
-        """Values of lanes in their worlds, [L, W, 1], of teams [L, W, S, 1], as those of the agents of each
-        world, [B, S]."""
+        """Reshape values of lanes in their worlds, [L, W, 1], or [L, W, S, 1] of teams, to values of the
+        agents of each world, [B, S]."""
         by_replica = values.reshape(self.replicas, -1, self.worlds, prod(self.members))
         return by_replica.transpose(1, 2).reshape(-1, len(self.agents))
 
     def by_agent(self, values: Tensor) -> Tensor:
-        """Values of networks as values of the agents of each replica, [R, S]; members of a team, and agents
-        that share a network, have the same."""
+        """Expand one value of each network to values of the agents of each replica, [R, S]; members of a
+        team, and agents that share a network, get the same value."""
         return values.view(self.replicas, -1).expand(-1, len(self.agents))
 
-    def by_network(self, marked: Tensor) -> Tensor:
-        """Flags of replicas, [R], as flags of networks."""
-        return marked.repeat_interleave(len(self) // self.sharing // self.replicas)
+    def by_network(self, replica_flags: Tensor) -> Tensor:
+        """Expand flags of replicas, bool [R], to flags of their networks, bool [L / `sharing`]."""
+        return replica_flags.repeat_interleave(len(self) // self.sharing // self.replicas)

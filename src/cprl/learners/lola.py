@@ -1,4 +1,4 @@
-"""LOLA: the memory and the networks of teams whose members learn with the others' learning in view."""
+"""The memory and the networks of LOLA teams, whose members anticipate how the others learn."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from copy import deepcopy
@@ -13,7 +13,7 @@ from cprl.keys import Turn
 from cprl.learners.draw import Draw
 from cprl.learners.lanes import Lanes
 from cprl.learners.optimizers import UpdateRule, clip_by_norm, torch_optimizer
-from cprl.learners.refusals import refuse_other_parts
+from cprl.learners.refusals import refuse_other_networks
 from cprl.learners.rollouts import Rollout, advantages
 from cprl.learners.settings import LOLASettings
 from cprl.learners.transitions import LaneTurn
@@ -24,37 +24,45 @@ from cprl.objectives.functional import total
 
 
 class Members(nn.ModuleList):
-    """One network of each of S members, with the parameters of R replicas; lane = replica x S + member."""
+    """A network for each of S members, each with the parameters of all R replicas.
+
+    A lane is one member of one replica, lane = replica x S + member.
+    """
 
     def forward(self, observation: Tensor) -> Tensor:
-        """[R, .., S, *shape] to [R, .., S, outputs]."""
+        """Map the observations of members, [R, .., S, *shape], to their outputs, [R, .., S, A]."""
         first: Any = self[0]
-        seen = observation.unbind(-1 - first.observation_dims)
-        return torch.stack([network(of_member) for network, of_member in zip(self, seen, strict=True)], -2)
+        by_member = observation.unbind(-1 - first.observation_dims)
+        return torch.stack([network(entry) for network, entry in zip(self, by_member, strict=True)], -2)
 
     def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Tensor:
-        """[R x S, k, *shape] to [R x S, k, outputs]; there is one part, 0."""
+        """Map the observations of lanes, [R x S, k, *shape], to their outputs, [R x S, k, A]."""
         by_replica = observation.reshape(-1, len(self), *observation.shape[1:]).transpose(1, 2)
         return self.forward(by_replica).transpose(1, 2).flatten(0, 1)
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
+        """Return copies of the weights of a lane, as the state dict of its network."""
         replica, member = divmod(lane, len(self))
         return lane_state(self[member], replica)
 
 
 class LOLANetworks(nn.Module):
-    """The actors and critics of all teams, and their optimisers.
+    """The actors and critics of all teams, with their loss and optimisers.
+
+    Actors exist up to three times: `actors` have the current weights, `players` are what members act with in
+    training, and `ahead`, for DiCE, have the weights after the learning step that the others are expected to
+    take.
 
     Args:
         networks: `AgentNetworks` of "actor" and "critic" for each lane, replica by replica.
         make_loss: makes the loss, a `LOLALoss` or `LOLADiCELoss`, from an `nn.ModuleList` of the members'
             networks.
-        members: their number S.
+        members: the number of members S.
     """
 
     loss: Any
     update: Final = "stacked"
-    """How its loss sees the replicas, see `cprl.learners.networks.Update`."""
+    """How its loss is computed for all replicas, see `cprl.learners.networks.Update`."""
 
     def __init__(
         self,
@@ -66,68 +74,81 @@ class LOLANetworks(nn.Module):
     ) -> None:
         super().__init__()
         self.settings = settings
-        stacks: list[Any] = [stack_lanes(networks[member::members]) for member in range(members)]
-        self.actors, self.critics = (
-            Members([stack[name] for stack in stacks]) for name in ("actor", "critic")
-        )
+        stacks: list[Any] = [stack_lanes(networks[agent::members]) for agent in range(members)]
+        self.actors = Members([stack["actor"] for stack in stacks])
+        self.critics = Members([stack["critic"] for stack in stacks])
         self.players = deepcopy(self.actors)
         loss = make_loss(nn.ModuleList(stacks))
         self.ahead = deepcopy(self.actors) if isinstance(loss, LOLADiCELoss) else None
         object.__setattr__(self, "loss", loss)  # no submodule: its weights are those of the actors
         self.rule = UpdateRule.of(settings)
-        of_critics = UpdateRule(learning_rate=settings.critic_learning_rate)
+        critic_rule = UpdateRule(learning_rate=settings.critic_learning_rate)
         self.optimizers = [
             torch_optimizer(self.rule, self.actors.parameters(), fused=None),
-            torch_optimizer(of_critics, self.critics.parameters(), fused=None),
+            torch_optimizer(critic_rule, self.critics.parameters(), fused=None),
         ]
 
     def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Tensor:
-        """The outputs of actors, part 0, or critics, with their present weights, [R x S, k, ...]."""
+        """Return the outputs of actors, part 0, or critics, part 1, with their current weights, [R x S, k,
+        ...]."""
         return (self.actors, self.critics)[part].outputs(observation)
 
-    def playing(self, *seen: Tensor) -> Tensor:
-        """The outputs by which members act in training."""
-        return self.players.outputs(*seen)
+    def playing(self, *inputs: Tensor) -> Tensor:
+        """Return the outputs by which members act in training."""
+        return self.players.outputs(*inputs)
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
-        """Copies of the present weights of an actor."""
+        """Return copies of the current weights of the actor of a lane."""
         return self.actors.network_state(lane)
 
-    def play(self, member: int | None) -> None:
-        """From now on all act by their present weights; with a member, the others by those ahead."""
-        for number, network in enumerate(self.players):
-            weights = self.actors if member in (None, number) or self.ahead is None else self.ahead
-            network.load_state_dict(weights[number].state_dict())
+    def play(self, learning_member: int | None) -> None:
+        """Set the weights by which members act from now on.
+
+        Args:
+            learning_member: the member that acts by its current weights, while the others act by those ahead;
+                None if all act by their current weights.
+        """
+        for member, player in enumerate(self.players):
+            acts_by_current = learning_member in (None, member)
+            source = self.actors if self.ahead is None or acts_by_current else self.ahead
+            player.load_state_dict(source[member].state_dict())
 
     def learn(self, draw: Draw) -> Tensor:
-        """Takes a step of all policies, then `critic_epochs` of the critics; returns each member's loss, [L].
+        """Take one step of all policies, then `critic_epochs` steps of the critics; return the losses, [L].
 
-        The batch are rollouts [R, P, W, T] of `LOLARollouts`. A loss is the mean discounted return of the
-        pieces of rollouts of the present weights, negative.
+        The batch has the rollouts of `LOLARollouts`, [R, P, W, T]. The loss of a member is its negative mean
+        discounted return in the segments of the rollouts that all played with their current weights.
         """
         batch = draw.gather(draw.columns)
         rollouts = batch.exclude("target", "reward")
-        self.update_policies(rollouts.flatten(1, 2) if self.ahead is None else rollouts)
+        policy_rollouts = rollouts.flatten(1, 2) if self.ahead is None else rollouts
+        self.update_policies(policy_rollouts)
         for _ in range(self.settings.critic_epochs):
             self.update_critics(batch["observation"].flatten(1, 2), batch["target"].flatten(1, 2))
         self.play(None)
-        judged = batch[:, : 2 if self.ahead is None else 1]
-        nothing = torch.zeros_like(judged["reward"])
-        returns = dice_objective(nothing, judged["reward"], gamma=self.settings.gamma, done=judged["done"])
+        current = batch[:, : 2 if self.ahead is None else 1]
+        zeros = torch.zeros_like(current["reward"])
+        returns = dice_objective(zeros, current["reward"], gamma=self.settings.gamma, done=current["done"])
         return -returns.mean((1, 2)).flatten()
 
     def look_ahead(self, rollouts: TensorDict) -> None:
-        """Puts the weights ahead to those after a naive step, from rollouts [R, B, T] of the present ones."""
+        """Set the weights ahead to those after a naive learning step of all members.
+
+        Args:
+            rollouts: [R, B, T], played by the current weights.
+        """
         assert isinstance(self.loss, LOLADiCELoss)
         assert self.ahead is not None
+        # The loss names weights otherwise than the actors do, so they are matched by their addresses.
         pairs = zip(self.actors.parameters(), self.ahead.parameters(), strict=True)
-        then = {value.data_ptr(): ahead for value, ahead in pairs}
-        for member, table in enumerate(self.loss.look_ahead(rollouts)):
-            present = self.loss.actors_params.get(str(member))
-            for key, value in table.items(True, True):
-                then[present.get(key).data_ptr()].data.copy_(value)
+        ahead_by_address = {current.data_ptr(): ahead for current, ahead in pairs}
+        for member, new_weights in enumerate(self.loss.look_ahead(rollouts)):
+            loss_weights = self.loss.actors_params.get(str(member))
+            for key, value in new_weights.items(True, True):
+                ahead_by_address[loss_weights.get(key).data_ptr()].data.copy_(value)
 
     def update_policies(self, rollouts: TensorDict) -> None:
+        """Take one step of all policies along LOLA's gradient, from rollouts [R, .., B, T]."""
         policies, _ = self.optimizers
         policies.zero_grad()
         loss: Any = total(self.loss(rollouts), self.loss)
@@ -137,31 +158,31 @@ class LOLANetworks(nn.Module):
                 weights = list(network.parameters())
                 gradients = [weight.grad for weight in weights if weight.grad is not None]
                 clipped = clip_by_norm(gradients, self.rule.max_grad_norm)
-                for weight, slope in zip(weights, clipped, strict=True):
-                    weight.grad = slope
+                for weight, gradient in zip(weights, clipped, strict=True):
+                    weight.grad = gradient
         policies.step()
 
     def update_critics(self, observation: Tensor, target: Tensor) -> None:
-        """One step of all critics along their mean squared errors, from observations [R, B, T, S, *shape] and
-        the values wanted, [R, B, T, S, 1]."""
+        """Take one step of all critics along their mean squared errors, from observations [R, B, T, S,
+        *shape] and target values [R, B, T, S, 1]."""
         _, critics = self.optimizers
         critics.zero_grad()
         (self.critics(observation) - target).square().mean((1, 2)).sum().backward()
         critics.step()
 
     def finite(self) -> Tensor:
-        """Whether the weights and moments of each member are finite, bool [R x S]."""
+        """Return for each lane whether its weights and optimiser state are finite, bool [R x S]."""
         states = {weight: state for optimizer in self.optimizers for weight, state in optimizer.state.items()}
         stacks = [self.actors, self.critics, self.players, *([] if self.ahead is None else [self.ahead])]
-        sound = []
-        for member in range(len(self.actors)):
-            weights = [weight for stack in stacks for weight in stack[member].parameters()]
+        are_finite = []
+        for agent in range(len(self.actors)):
+            weights = [weight for stack in stacks for weight in stack[agent].parameters()]
             moments = [value for weight in weights for value in states.get(weight, {}).values() if value.ndim]
-            sound.append(finite_lanes([*weights, *moments]))
-        return torch.stack(sound, -1).flatten()
+            are_finite.append(finite_lanes([*weights, *moments]))
+        return torch.stack(are_finite, -1).flatten()
 
     def get_extra_state(self) -> list[dict[str, Any]]:
-        """The state of both optimisers; part of `state_dict`."""
+        """Return the states of both optimisers; part of `state_dict`."""
         return [optimizer.state_dict() for optimizer in self.optimizers]
 
     def set_extra_state(self, state: list[dict[str, Any]]) -> None:
@@ -170,67 +191,75 @@ class LOLANetworks(nn.Module):
 
 
 class LOLARollouts:
-    """Stores P rollouts of T turns of W worlds, one after the other, and then gives them as one batch.
+    """A memory that stores P rollouts of T turns of W worlds, one after the other, and yields them as one
+    batch.
 
-    With a `LOLALoss` they are two, of the present weights, which are its two independent batches. With a
-    `LOLADiCELoss` they are 1 + S: one of the present weights; then for each member one in which the others
-    act by their weights ahead. Networks, evaluation and checkpoints have the present weights throughout.
+    `LOLALoss` needs two rollouts by the current weights, its two independent batches. `LOLADiCELoss` needs
+    1 + S rollouts: one by the current weights, and one for each member in which the others act by their
+    weights ahead. Stored networks, evaluations and checkpoints always have the current weights.
 
     Args:
-        rollouts: P.
+        rollouts: the number of rollouts P.
     """
 
     sequence_steps: Final = 1
 
     def __init__(self, lanes: Lanes, settings: LOLASettings, network: nn.Module, *, rollouts: int) -> None:
-        refuse_other_parts(network)
-        self.lanes, self.settings, self.rollouts = lanes, settings, rollouts
+        refuse_other_networks(network)
+        self.lanes = lanes
+        self.settings = settings
+        self.rollouts = rollouts
         self.form = lanes.form()
         self.rollout = Rollout(lanes, settings.rollout_steps, self.form, rollouts)
         self._phase = 0
+        """The index of the current rollout, 0 to P - 1."""
 
     def write(self, turn: Turn, lane_turn: LaneTurn) -> None:
-        """Stores a turn, as all agents had it, and as these lanes did."""
+        """Store a turn; `cprl.learners.learner.Memory.write` says the arguments."""
         self.rollout.refuse_full()
         self.rollout.write(lane_turn, self._phase)
 
     def due(self, networks: LOLANetworks) -> Iterator[Draw]:
-        """All rollouts, after the last one. After the others the next one may be of weights ahead."""
+        """Yield all rollouts when the last one is full; when another one is full, set the weights by which
+        members play the next one."""
         if not self.rollout.is_full:
             return
-        self.rollout.size, self._phase = 0, self._phase + 1
+        self.rollout.size = 0
+        self._phase += 1
         if self._phase == self.rollouts:
             self._phase = 0
             yield Draw.of(self.batch(networks, self.rollouts))
         elif networks.ahead is not None:
             if self._phase == 1:
-                present = self.batch(networks, 1)
-                networks.look_ahead(present.exclude("target", "reward").flatten(1, 2))
+                rollout = self.batch(networks, 1)
+                networks.look_ahead(rollout.exclude("target", "reward").flatten(1, 2))
             networks.play(self._phase - 1)
 
     @torch.no_grad()
     def batch(self, networks: LOLANetworks, rollouts: int) -> TensorDict:
-        """The first rollouts, [R, P, W, T], of entries [.., S, ...]: with advantages, and under "target" what
-        critics should say, [.., S, 1]."""
+        """Return the first `rollouts` rollouts, [R, P, W, T], with entries of members [.., S, ...]: also
+        "advantage", and "target", the targets of the critics, [.., S, 1]."""
         size = self.lanes.replicas, len(self.lanes.agents)
         columns = {
             name: field[:rollouts].view(rollouts, *size, *field.shape[2:]).movedim((1, 2), (0, 4))
             for name, field in self.rollout.fields.items()
         }
         critics = networks.critics
-        options: dict[str, Any] = {"settings": self.settings, "over": (2, 3), "time_dim": 3}
-        value, following = critics(columns["observation"]), critics(columns["next_observation"])
-        advantage, target = advantages(columns, value, following, **options)
+        value = critics(columns["observation"])
+        next_value = critics(columns["next_observation"])
+        advantage, target = advantages(
+            columns, value, next_value, settings=self.settings, over=(2, 3), time_dim=3
+        )
         entries = {name: columns[name] for name in ("observation", "action", "reward")}
         entries |= {"advantage": advantage, "target": target, "done": columns["done"][..., :1]}
         return TensorDict(entries, columns["reward"].shape[:4])
 
     def values(self, networks: LOLANetworks, turn: Turn) -> Tensor:
-        """What critics say of the state after a turn, [L, W, 1]."""
-        return networks.critics.outputs(self.lanes.seen_next(turn))
+        """Return the critics' value of the state after a turn, [L, W, 1]."""
+        return networks.critics.outputs(self.lanes.next_observations(turn))
 
     def cut(self, networks: LOLANetworks) -> None:
-        """Drops the rollouts that a training left unfinished."""
+        """Drop the rollouts that a training left unfinished."""
         self.rollout.size = self._phase = 0
         networks.play(None)
 

@@ -1,4 +1,4 @@
-"""How a gradient changes the weights of lanes: optimisers of torch, for all lanes at once, and clipping."""
+"""Optimisers for the weights of all lanes at once: how a gradient changes weights, and how it is clipped."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,17 +12,18 @@ from cprl.learners.settings import Optimizer
 
 @dataclass(frozen=True, kw_only=True)
 class UpdateRule:
-    """How a gradient changes weights: the optimiser, clipping, and how targets follow."""
+    """An optimiser with its hyperparameters, gradient clipping, and how targets follow the weights."""
 
     optimizer: Optimizer = "adam"
-    """The name of the optimiser of `torch.optim`."""
+    """The name of the optimiser."""
     learning_rate: float
-    falls: bool = False
-    """Whether the learning rate changes from step to step."""
+    """The learning rate of the first step."""
+    decays: bool = False
+    """True if the learning rate changes from step to step."""
     adam_eps: float = 1e-8
     """The optimiser's epsilon, if it has one."""
     loss_share: float = 1.0
-    """A factor of each loss."""
+    """The factor by which losses are multiplied."""
     max_grad_norm: float | None = None
     """The norm to which each lane's gradient is clipped; None for no clipping."""
     tau: float | None = None
@@ -32,14 +33,15 @@ class UpdateRule:
 
     @classmethod
     def of(cls, settings: Any, *, loss_share: float = 1.0) -> "UpdateRule":
-        """That of the hyperparameters of an agent, as far as they say."""
+        """Return the rule that an agent's settings say; fields that the settings lack keep their defaults."""
         names = ("optimizer", "learning_rate", "adam_eps", "max_grad_norm", "tau", "target_every_updates")
-        said = {name: getattr(settings, name) for name in names if hasattr(settings, name)}
-        falls = getattr(settings, "learning_rate_end", None) is not None
-        return cls(**said, falls=falls, loss_share=loss_share)
+        fields = {name: getattr(settings, name) for name in names if hasattr(settings, name)}
+        decays = getattr(settings, "learning_rate_end", None) is not None
+        return cls(**fields, decays=decays, loss_share=loss_share)
 
 
-BETA_1, BETA_2 = 0.9, 0.999
+BETA_1: Final = 0.9
+BETA_2: Final = 0.999
 """Adam's decay rates (Kingma and Ba 2015, torch's defaults)."""
 ADAMW_DECAY: Final = 0.01
 """AdamW's weight decay (Loshchilov and Hutter 2019, torch's default)."""
@@ -55,14 +57,19 @@ WITH_SQUARE: Final = ("adam", "adamw", *RMSPROP_ALPHAS)
 def torch_optimizer(
     rule: UpdateRule, parameters: Iterable[Tensor], *, fused: bool | None = True
 ) -> torch.optim.Optimizer:
-    """The optimiser of one lane; `fused` where torch has such a form of it, None for torch's default."""
-    name, rate, eps = rule.optimizer, rule.learning_rate, rule.adam_eps
-    if name in RMSPROP_ALPHAS:
-        return torch.optim.RMSprop(parameters, lr=rate, eps=eps, alpha=RMSPROP_ALPHAS[name])
-    if name == "sgd":
+    """Return torch's optimiser of the weights of one lane.
+
+    Args:
+        fused: whether torch takes its fused implementation, where there is one; None for torch's default.
+    """
+    rate = rule.learning_rate
+    if rule.optimizer in RMSPROP_ALPHAS:
+        alpha = RMSPROP_ALPHAS[rule.optimizer]
+        return torch.optim.RMSprop(parameters, lr=rate, eps=rule.adam_eps, alpha=alpha)
+    if rule.optimizer == "sgd":
         return torch.optim.SGD(parameters, lr=rate, fused=fused)
-    kind = torch.optim.Adam if name == "adam" else torch.optim.AdamW
-    return kind(parameters, lr=rate, eps=eps, fused=fused)
+    optimizer_class = torch.optim.Adam if rule.optimizer == "adam" else torch.optim.AdamW
+    return optimizer_class(parameters, lr=rate, eps=rule.adam_eps, fused=fused)
 
 
 def change_weights(
@@ -76,42 +83,45 @@ def change_weights(
     step_size: Tensor,
     scale: Tensor,
 ) -> None:
-    """One step of all lanes, in place.
+    """Change the weights of all lanes by one step of the optimiser, in place.
+
+    The results are those of torch's optimisers, up to rounding.
 
     Args:
-        weights: [L, ...] each.
+        weights: the weights of all lanes, [L, ...] each.
+        gradients: their gradients, in the same order and shapes.
         means: running means of gradients; empty if the optimiser has none.
-        squares: running means of squared gradients, likewise.
-        rate: the learning rate; a number is a constant of compiled code.
+        squares: running means of squared gradients; empty if the optimiser has none.
+        rate: the learning rate; in compiled code a number is a constant, a tensor is not.
         step_size: Adam's learning rate with bias correction.
         scale: the bias correction of the root of Adam's `squares`.
     """
     if rule.max_grad_norm is not None:
         gradients = clip_by_norm(gradients, rule.max_grad_norm)
-    name, eps = rule.optimizer, rule.adam_eps
-    if name in WITH_MEAN:
-        for weight, slope, mean, square in zip(weights, gradients, means, squares, strict=True):
-            if name == "adamw":
+    if rule.optimizer in WITH_MEAN:
+        for weight, gradient, mean, square in zip(weights, gradients, means, squares, strict=True):
+            if rule.optimizer == "adamw":
                 weight.mul_(1 - rate * ADAMW_DECAY)
-            mean.mul_(BETA_1).add_(slope, alpha=1 - BETA_1)
-            square.mul_(BETA_2).addcmul_(slope, slope, value=1 - BETA_2)
-            weight.sub_(step_size * mean / (square.sqrt() * scale + eps))
-    elif name in RMSPROP_ALPHAS:
-        alpha = RMSPROP_ALPHAS[name]
-        for weight, slope, square in zip(weights, gradients, squares, strict=True):
-            square.mul_(alpha).addcmul_(slope, slope, value=1 - alpha)
-            weight.sub_(rate * slope / (square.sqrt() + eps))
+            mean.mul_(BETA_1).add_(gradient, alpha=1 - BETA_1)
+            square.mul_(BETA_2).addcmul_(gradient, gradient, value=1 - BETA_2)
+            weight.sub_(step_size * mean / (square.sqrt() * scale + rule.adam_eps))
+    elif rule.optimizer in RMSPROP_ALPHAS:
+        alpha = RMSPROP_ALPHAS[rule.optimizer]
+        for weight, gradient, square in zip(weights, gradients, squares, strict=True):
+            square.mul_(alpha).addcmul_(gradient, gradient, value=1 - alpha)
+            weight.sub_(rate * gradient / (square.sqrt() + rule.adam_eps))
     else:
-        for weight, slope in zip(weights, gradients, strict=True):
+        for weight, gradient in zip(weights, gradients, strict=True):
             if isinstance(rate, Tensor):
-                weight.sub_(rate * slope)
-            else:  # rounds once
-                weight.sub_(slope, alpha=rate)
+                weight.sub_(rate * gradient)
+            else:  # rounds once instead of twice
+                weight.sub_(gradient, alpha=rate)
 
 
 def clip_by_norm(gradients: Sequence[Tensor], max_norm: float) -> list[Tensor]:
-    """Gradients [L, ...] of all weights, scaled down for lanes whose gradient norm exceeds `max_norm`."""
-    squares = [slope.reshape(len(slope), -1).square().sum(1) for slope in gradients]
+    """Return gradients of all weights, [L, ...] each, scaled down in lanes whose gradient has a norm above
+    `max_norm`."""
+    squares = [gradient.reshape(len(gradient), -1).square().sum(1) for gradient in gradients]
     norms = torch.stack(squares).sum(0).sqrt()
     scales = (max_norm / (norms + 1e-6)).clamp(max=1.0)
-    return [slope * scales.reshape(-1, *[1] * (slope.ndim - 1)) for slope in gradients]
+    return [gradient * scales.reshape(-1, *[1] * (gradient.ndim - 1)) for gradient in gradients]

@@ -1,11 +1,13 @@
-"""How agents learn, by TorchRL's stock parts: read this first.
+"""How agents learn, in plain code by TorchRL's stock parts: read this module first.
 
 `train_plainly` is a whole training: agents act, and their learner stores each turn and learns. A learner has
 a memory, which says when there is a batch to learn from, and networks, which learn from it. Here every agent
-has a loss of TorchRL's, an optimiser of torch.optim and a `TensorDictReplayBuffer` of its own, and one learns
-after the other: engine="torchrl". When an update is due stands in `replay.Replay.due`, which this takes over
-with other buffers, and when targets are copied in `learner.Learner.end_episode`. `networks`, `ring` and
-`rollouts` compute the same for all agents at once, and are tested against this.
+has a TorchRL loss, a torch optimiser and a `TensorDictReplayBuffer` of its own, and agents learn one after
+the other. This is engine="torchrl".
+
+`Replay.due` says when an update is due, and `Learner.end_episode` when targets are copied; both also hold
+here. The modules `networks`, `ring` and `rollouts` compute the same for all agents at once, and are tested
+against this one.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -24,19 +26,19 @@ from torchrl.envs import EnvBase
 from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.value import GAE
 
-from cprl.learners.base import AnyLearner
 from cprl.learners.lanes import Lanes
 from cprl.learners.networks import MakeLoss
 from cprl.learners.optimizers import UpdateRule, torch_optimizer
+from cprl.learners.protocol import AnyLearner
 from cprl.learners.replay import Replay
 from cprl.learners.ring import Noise, stored_bytes
 from cprl.learners.rollouts import ACTOR, Rollouts
 from cprl.learners.settings import RolloutSettings
 from cprl.learners.transitions import LaneTurn, transitions_of
-from cprl.networks.agent import parts_of
+from cprl.networks.agent import networks_by_name
 from cprl.networks.finite import all_finite
-from cprl.objectives.functional import attributes_of, own_targets, set_attributes, targets_of, total
-from cprl.policies.assignment import AgentPolicies
+from cprl.objectives.functional import attributes_of, mark_targets_updated, set_attributes, targets_of, total
+from cprl.policies.joint_policy import JointPolicy
 from cprl.policies.rng import Purpose, seed_of
 from cprl.system.memory import check_memory
 
@@ -46,12 +48,12 @@ def train_plainly(env: EnvBase, learner: AnyLearner, *, episodes: int) -> None:
 
     Args:
         env: the worlds of all replicas, [B].
-        learner: of all agents, e.g. `DQN(settings=settings).make_learner(lanes, "torchrl")`.
-        episodes: how many are played, in all worlds together.
+        learner: the learner of all agents, e.g. `DQN(settings=settings).make_learner(lanes, "torchrl")`.
+        episodes: the number of episodes to play, in all worlds together.
     """
     learner.begin()
-    policy = AgentPolicies({learner.agents: learner.actor})
-    # Without an end, and in the environment as it is.
+    policy = JointPolicy({learner.agents: learner.actor})
+    # The collector itself never stops, and adds no transforms to the environment.
     options: dict[str, Any] = {"total_frames": -1, "auto_register_policy_transforms": False}
     played = 0
     for turns in Collector(env, policy, frames_per_batch=env.batch_size.numel(), **options):
@@ -66,11 +68,12 @@ def train_plainly(env: EnvBase, learner: AnyLearner, *, episodes: int) -> None:
 
 
 class PlainNetworks:
-    """The networks of all agents; each agent has a loss over its own, an optimiser, and perhaps targets.
+    """The networks of all agents, each with a loss of its own, an optimiser, and targets if the loss has any.
 
     Args:
-        networks: of each agent, which are trained in place.
+        networks: the networks of each agent, which are trained in place.
         make_loss: makes TorchRL's loss from a network.
+        rule: how a gradient changes weights, and how targets follow.
         target_networks: networks with the initial target weights; by default targets start as copies.
     """
 
@@ -84,11 +87,14 @@ class PlainNetworks:
         *,
         target_networks: Sequence[nn.Module] | None = None,
     ) -> None:
-        self.rule, self.learning_rate, self.updates = rule, rule.learning_rate, 0
-        self.parts = [list(parts_of(network).values()) for network in networks]
+        self.rule = rule
+        self.learning_rate = rule.learning_rate
+        self.updates = 0
+        self.parts = [list(networks_by_name(network).values()) for network in networks]
+        """The networks of each agent, the acting one first."""
         self.losses = [make_loss(network) for network in networks]
         for loss in self.losses:
-            own_targets(loss)
+            mark_targets_updated(loss)
         self.targets = [_new_updater(loss, rule) for loss in self.losses]
         for loss, network in zip(self.losses, target_networks or (), strict=False):
             for name, weights in targets_of(make_loss(network)).items():
@@ -96,17 +102,18 @@ class PlainNetworks:
         self.optimizers = [torch_optimizer(rule, loss.parameters()) for loss in self.losses]
 
     def learn(self, batch: TensorDictBase) -> Tensor:
-        """Takes one step of each agent from a batch of its own, [L, b]; returns the losses, [L]."""
-        losses = torch.stack([self.learn_of(agent, of_agent) for agent, of_agent in enumerate(batch)])
+        """Take one step of each agent from a batch of its own, [L, b]; return the losses, [L]."""
+        losses = torch.stack([self.learn_agent(agent, batch[agent]) for agent in range(len(batch))])
         self.updates += 1
-        every = self.rule.target_every_updates
-        if every is not None and self.updates % every == 0:
+        period = self.rule.target_every_updates
+        if period is not None and self.updates % period == 0:
             self.copy_to_targets(torch.ones(len(losses), dtype=torch.bool))
         return losses
 
-    def learn_of(self, agent: int, batch: TensorDictBase) -> Tensor:
-        """Takes one step of an agent along the gradient of its loss, from a batch, [b]; returns the loss."""
-        module, optimizer = self.losses[agent], self.optimizers[agent]
+    def learn_agent(self, agent: int, batch: TensorDictBase) -> Tensor:
+        """Take one step of an agent along the gradient of its loss, from a batch, [b]; return the loss."""
+        module = self.losses[agent]
+        optimizer = self.optimizers[agent]
         loss = total(module(batch), module).mean() * self.rule.loss_share
         optimizer.zero_grad()
         loss.backward()  # type: ignore[no-untyped-call]
@@ -119,24 +126,31 @@ class PlainNetworks:
         return loss.detach()
 
     def outputs(self, observation: Tensor, *, part: int = ACTOR) -> Tensor:
-        """The outputs of one network of each agent, by default the acting one: [L, k, ...] to [L, k, ...]."""
-        each = zip(self.parts, observation, strict=True)
-        return torch.stack([parts[part](of_agent) for parts, of_agent in each])
+        """Return the outputs of one network of each agent, by default the acting one, [L, k, ...].
 
-    def copy_to_targets(self, which: Tensor) -> None:
-        """Copies the weights of the marked agents, bool [L], to their targets."""
-        for is_marked, targets in zip(which.tolist(), self.targets, strict=True):
-            if is_marked and targets is not None:
-                targets.step()
+        Args:
+            observation: what each agent observes, [L, k, ...].
+            part: the index of the network among an agent's networks.
+        """
+        outputs = []
+        for networks, agent_observation in zip(self.parts, observation, strict=True):
+            outputs.append(networks[part](agent_observation))
+        return torch.stack(outputs)
+
+    def copy_to_targets(self, marked: Tensor) -> None:
+        """Copy the weights of the marked agents, bool [L], to their targets."""
+        for is_marked, updater in zip(marked.tolist(), self.targets, strict=True):
+            if is_marked and updater is not None:
+                updater.step()
 
     def network_state(self, agent: int) -> dict[str, Tensor]:
-        """Copies of the weights of an acting network, as its state dict."""
+        """Return copies of the weights of an acting network, as its state dict."""
         return deepcopy(self.parts[agent][ACTOR].state_dict())
 
     def finite(self) -> Tensor:
-        """Whether weights, targets and moments of agents are finite, bool [L]."""
-        leaves = [tree_leaves(of_agent) for of_agent in self.state_dict()["agents"]]
-        return torch.tensor([all_finite(filter(torch.is_tensor, of_agent)) for of_agent in leaves])
+        """Return for each agent whether its weights, targets and optimiser state are finite, bool [L]."""
+        leaves = [tree_leaves(agent) for agent in self.state_dict()["agents"]]
+        return torch.tensor([all_finite(filter(torch.is_tensor, tensors)) for tensors in leaves])
 
     def state_dict(self) -> dict[str, Any]:
         agents = [
@@ -150,14 +164,15 @@ class PlainNetworks:
         return {"agents": agents, "updates": self.updates}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        for loss, optimizer, of_agent in zip(self.losses, self.optimizers, state["agents"], strict=True):
-            loss.load_state_dict(of_agent["loss"])
-            set_attributes(loss, of_agent["attributes"])
-            optimizer.load_state_dict(of_agent["optimizer"])
+        for loss, optimizer, agent in zip(self.losses, self.optimizers, state["agents"], strict=True):
+            loss.load_state_dict(agent["loss"])
+            set_attributes(loss, agent["attributes"])
+            optimizer.load_state_dict(agent["optimizer"])
         self.updates = int(state["updates"])
 
 
 def _new_updater(loss: LossModule, rule: UpdateRule) -> Any:
+    """Return TorchRL's updater of the targets of a loss; None if it has no targets."""
     if not targets_of(loss):
         return None
     if rule.tau is not None:
@@ -166,12 +181,14 @@ def _new_updater(loss: LossModule, rule: UpdateRule) -> Any:
 
 
 class PlainBuffers:
-    """A `TensorDictReplayBuffer` of each agent, with random numbers of its own.
+    """A `TensorDictReplayBuffer` for each agent, with its own random generator.
 
     Args:
+        lanes: the agents that learn.
         make_sampler: makes the sampler of a buffer.
-        size: of a buffer, in transitions.
-        noise_shape: of the uniform numbers that the loss reads with each transition.
+        size: the capacity of each buffer, in transitions.
+        batch_size: the transitions b in each batch.
+        noise_shape: the shape of the uniform numbers that the loss reads with each transition; () for none.
     """
 
     def __init__(
@@ -207,25 +224,25 @@ class PlainBuffers:
             self.noise = Noise(lanes.seeds(Purpose.NOISE), batch_size, noise_shape, device)
 
     def write(self, turn: LaneTurn) -> None:
-        """Stores a turn of every agent in all of its worlds."""
+        """Store a turn of every agent in all of its worlds."""
         self.extend(transitions_of(turn._asdict())[self.columns])
 
     def extend(self, transitions: TensorDictBase) -> None:
-        """Stores transitions of every agent, [L, n]."""
-        for buffer, of_agent in zip(self.each, transitions, strict=True):
-            buffer.extend(of_agent)
+        """Store transitions of every agent, [L, n]."""
+        for buffer, rows in zip(self.each, transitions, strict=True):
+            buffer.extend(rows)
 
     def draw(self) -> TensorDict:
-        """A batch of every agent, [L, b]."""
+        """Return a batch of every agent, [L, b]."""
         batch: TensorDict = torch.stack([buffer.sample() for buffer in self.each])
         return batch if self.noise is None else batch.set("noise", self.noise.next())
 
     def cut(self) -> None:
-        """Does nothing: transitions know nothing of those after them."""
+        """Do nothing: stored transitions do not refer to the turns after them."""
 
     def state_dict(self) -> dict[str, Any]:
-        """The full state with the written transitions alone; that of `TensorDictReplayBuffer` includes all
-        allocated memory."""
+        """Return the full state, with the transitions that were written; the state of TorchRL's buffer would
+        include all allocated memory."""
         buffers = [
             {
                 "transitions": buffer[:].clone().to_dict() if len(buffer) else {},
@@ -248,8 +265,7 @@ class PlainBuffers:
 
 
 class PlainReplay(Replay):
-    """Draws batches of all that agents remember from TorchRL's replay buffers, from which DQN learns after
-    each step (Mnih et al. 2015); `Replay` says when one is due."""
+    """A `Replay` with TorchRL's replay buffers: the memory of DQN (Mnih et al. 2015)."""
 
     def _refuse_other_sequences(self) -> None:
         name = "n_steps" if self.settings.n_steps > 1 else "sequence_steps"
@@ -262,8 +278,9 @@ class PlainReplay(Replay):
             )
 
     def _make_buffer(self) -> PlainBuffers:
-        lanes, settings = self.lanes, self.settings
-        # Pages of the storage are committed as they fill: too little memory would be noticed hours later.
+        lanes = self.lanes
+        settings = self.settings
+        # The system gives out memory as a buffer fills: without this check it could run out hours later.
         check_memory(
             f"the replay buffers of {len(lanes)} agents x {settings.buffer_size:,} transitions",
             2 * stored_bytes(self.form, len(lanes), settings.buffer_size),
@@ -280,8 +297,7 @@ class PlainReplay(Replay):
 
 
 class PlainRollouts(Rollouts):
-    """Gives minibatches of the latest turns from TorchRL's replay buffers, with advantages by its `GAE`, from
-    which PPO learns (Schulman et al. 2017)."""
+    """A `Rollouts` with TorchRL's replay buffers and its `GAE`: the memory of PPO (Schulman et al. 2017)."""
 
     def __init__(self, lanes: Lanes, settings: RolloutSettings, network: nn.Module, loss: LossModule) -> None:
         super().__init__(lanes, settings, network, loss)
@@ -301,7 +317,7 @@ class PlainRollouts(Rollouts):
         )
 
     def due(self, networks: Any) -> Iterator[TensorDict]:
-        """The minibatches of all epochs over a full rollout; none while it is not full."""
+        """Yield the minibatches of all epochs over a full rollout; none while it is not full."""
         if not self.rollout.is_full:
             return
         self.rollout.size = 0
@@ -313,13 +329,13 @@ class PlainRollouts(Rollouts):
             buffer.empty()  # a checkpoint holds the rollout once
 
     def _batch(self, networks: Any) -> TensorDict:
-        """The steps of the rollout, [L, W x T], as losses read them."""
+        """Return the rollout with advantages, [L, W x T], under the keys of TorchRL's losses."""
         rollouts = zip(networks.parts, transitions_of(self.rollout.fields), strict=True)
-        return torch.stack([self._judged(rollout, *parts[:2]) for parts, rollout in rollouts])
+        return torch.stack([self._with_advantages(rollout, *parts[:2]) for parts, rollout in rollouts])
 
     @torch.no_grad()
-    def _judged(self, rollout: TensorDict, actor: nn.Module, critic: nn.Module) -> TensorDict:
-        """The rollout of an agent, [W, T] to [W x T], with advantages and the policy that chose actions."""
+    def _with_advantages(self, rollout: TensorDict, actor: nn.Module, critic: nn.Module) -> TensorDict:
+        """Return the rollout of an agent, [W, T], as steps [W x T] with advantages, logits and log-probs."""
         add_advantages = GAE(
             gamma=self.settings.gamma,
             lmbda=self.settings.gae_lambda,

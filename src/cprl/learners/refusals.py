@@ -1,4 +1,5 @@
-"""What learners refuse before anything is written: losses and networks that do not fit their memory."""
+"""Checks of a user's losses and networks: those that do not fit the memory or the settings are refused before
+a training writes anything."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,15 +10,18 @@ from torch import Tensor, nn
 from torchrl.objectives import A2CLoss, LossModule, PPOLoss, ReinforceLoss, ValueEstimators
 from torchrl.objectives.value import GAE, TD0Estimator, ValueEstimatorBase
 
-from cprl.learners.kept import kept_by
+from cprl.learners.loss_state import changed_state
 from cprl.learners.settings import DQNSettings, RolloutSettings
-from cprl.networks.agent import AgentNetworks, parts_of
-from cprl.objectives.functional import make_lazy_parts, own_targets, targets_of, total
+from cprl.networks.agent import AgentNetworks, networks_by_name
+from cprl.objectives.functional import make_lazy_parts, mark_targets_updated, targets_of, total
 
 
 def refuse_for_replay(loss: LossModule, settings: DQNSettings, make_batch: Callable[[], TensorDict]) -> None:
-    """Raises a ValueError if the loss of a lane cannot learn from a replay buffer with these settings; with
-    `n_steps` above 1 it is tried with synthetic transitions, [b]."""
+    """Raise a ValueError if the loss of a lane cannot learn from a replay buffer with these settings.
+
+    Args:
+        make_batch: makes synthetic transitions, [b]; with `n_steps` above 1 the loss is tried with them.
+    """
     name = type(loss).__name__
     if isinstance(loss, A2CLoss | PPOLoss | ReinforceLoss):
         raise ValueError(
@@ -37,9 +41,9 @@ def refuse_for_replay(loss: LossModule, settings: DQNSettings, make_batch: Calla
             )
     if settings.n_steps == 1:
         return
-    for owner in (loss, *_estimators(loss)):
-        _refuse_another(loss, owner, "gamma", "gamma", settings)
-    own_targets(loss)
+    for holder in (loss, *_estimators(loss)):
+        _refuse_other_number(loss, holder, "gamma", "gamma", settings)
+    mark_targets_updated(loss)
     if _ignores_steps(loss, make_batch()):
         raise ValueError(
             f'n_steps is {settings.n_steps}; allowed: 1, because {name} does not read "steps_to_next_obs" '
@@ -48,26 +52,32 @@ def refuse_for_replay(loss: LossModule, settings: DQNSettings, make_batch: Calla
 
 
 def refuse_other_advantages(loss: LossModule, settings: RolloutSettings) -> None:
-    """Raises a ValueError if a loss needs other advantages than those of `Rollouts`."""
-    kind = loss.value_type
-    is_gae = isinstance(kind, type) and issubclass(kind, GAE)
-    if not is_gae and kind not in (None, ValueEstimators.GAE, ValueEstimators.MAGAE):
+    """Raise a ValueError if a loss needs other advantages than `Rollouts` computes."""
+    estimator = loss.value_type
+    is_gae = isinstance(estimator, type) and issubclass(estimator, GAE)
+    if not is_gae and estimator not in (None, ValueEstimators.GAE, ValueEstimators.MAGAE):
         raise ValueError(
-            f"{type(loss).__name__} has the value estimator {kind}; allowed: GAE, which "
+            f"{type(loss).__name__} has the value estimator {estimator}; allowed: GAE, which "
             "Rollouts computes: leave make_value_estimator out, and set gamma and gae_lambda in the "
             "settings"
         )
-    for owner in _estimators(loss):
-        _refuse_another(loss, owner, "gamma", "gamma", settings)
-        _refuse_another(loss, owner, "lmbda", "gae_lambda", settings)
+    for estimator_module in _estimators(loss):
+        _refuse_other_number(loss, estimator_module, "gamma", "gamma", settings)
+        _refuse_other_number(loss, estimator_module, "lmbda", "gae_lambda", settings)
 
 
-def _refuse_another(
-    loss: LossModule, owner: Any, name: str, field: str, settings: DQNSettings | RolloutSettings
+def _refuse_other_number(
+    loss: LossModule, holder: Any, name: str, field: str, settings: DQNSettings | RolloutSettings
 ) -> None:
-    """Raises a ValueError if a loss or an estimator of it has another number than the settings."""
+    """Raise a ValueError if a loss, or its value estimator, has another number than the settings.
+
+    Args:
+        holder: the loss or the estimator.
+        name: the attribute of the holder, if it has one.
+        field: the field of the settings that must be equal.
+    """
     expected = getattr(settings, field)
-    value = float(getattr(owner, name, expected))
+    value = float(getattr(holder, name, expected))
     if abs(value - expected) > 1e-6:
         raise ValueError(
             f"{type(loss).__name__} has {name} {value:g} and the settings have {field} {expected:g}, "
@@ -76,18 +86,19 @@ def _refuse_another(
 
 
 def check_loss(loss: LossModule, batch: TensorDict) -> list[str]:
-    """Return the names of what a loss keeps from call to call, of two calls with a batch, [b].
+    """Call a loss twice with a batch, [b]; return the names of the state that it keeps between calls.
 
     Raises:
         ValueError: if it reads entries that the batch does not have, returns no loss, draws from torch's
-            generator, or keeps what a checkpoint does not have, see `kept_by`.
+            global generator, or keeps state that no checkpoint has, see `changed_state`.
     """
-    own_targets(loss)
+    mark_targets_updated(loss)
     make_lazy_parts(loss)
-    return kept_by(loss, lambda: _check_call(loss, batch.clone()))
+    return changed_state(loss, lambda: _check_call(loss, batch.clone()))
 
 
 def _check_call(loss: LossModule, batch: TensorDict) -> None:
+    """Call a loss; raise a ValueError if it lacks entries of the batch or draws from torch's generator."""
     entries = ", ".join(sorted(batch.flatten_keys("/").keys()))
     with torch.random.fork_rng(devices=[]):
         state = torch.get_rng_state()
@@ -106,7 +117,7 @@ def _check_call(loss: LossModule, batch: TensorDict) -> None:
 
 
 def reads(loss: LossModule, key: str) -> bool:
-    """Whether a loss lists an entry among those that it reads."""
+    """Return whether a loss says that it reads an entry."""
     try:
         return key in (getattr(loss, "in_keys", None) or ())
     except NotImplementedError:
@@ -114,27 +125,32 @@ def reads(loss: LossModule, key: str) -> bool:
 
 
 def _estimators(loss: LossModule) -> list[ValueEstimatorBase]:
+    """Return the value estimators of a loss."""
     return [child for child in loss.children() if isinstance(child, ValueEstimatorBase)]
 
 
 def _ignores_steps(loss: LossModule, batch: TensorDict) -> bool:
-    """Whether a loss bootstraps with a discount that does not depend on the steps of a return."""
+    """Return whether a loss bootstraps with a discount that does not depend on the steps of a return.
 
-    def of(steps: int, *, ends: bool) -> Tensor:
-        tried = batch.clone()
-        tried["steps_to_next_obs"] = torch.full_like(tried["steps_to_next_obs"], steps)
-        tried["next", "terminated"] = torch.full_like(tried["next", "terminated"], ends)
+    It bootstraps if its value depends on whether episodes terminate.
+    """
+
+    def loss_with(steps: int, *, terminated: bool) -> Tensor:
+        trial = batch.clone()
+        trial["steps_to_next_obs"] = torch.full_like(trial["steps_to_next_obs"], steps)
+        trial["next", "terminated"] = torch.full_like(trial["next", "terminated"], terminated)
         with torch.no_grad(), torch.random.fork_rng(devices=[]):
             torch.manual_seed(0)
-            value: Tensor = total(loss(tried), loss).mean()
+            value: Tensor = total(loss(trial), loss).mean()
         return value
 
-    bootstraps = not torch.equal(of(1, ends=False), of(1, ends=True))
-    return bootstraps and torch.equal(of(1, ends=False), of(99, ends=False))
+    one_step = loss_with(1, terminated=False)
+    bootstraps = not torch.equal(one_step, loss_with(1, terminated=True))
+    return bootstraps and torch.equal(one_step, loss_with(99, terminated=False))
 
 
-def refuse_other_parts(network: nn.Module) -> None:
-    """Raises a ValueError unless an agent has an "actor" and a "critic"."""
-    parts = list(parts_of(network))
-    if not isinstance(network, AgentNetworks) or parts[:2] != ["actor", "critic"]:
-        raise ValueError(f'an agent has the networks {parts}; allowed: "actor" and "critic"')
+def refuse_other_networks(network: nn.Module) -> None:
+    """Raise a ValueError unless the networks of an agent are an "actor" and a "critic"."""
+    names = list(networks_by_name(network))
+    if not isinstance(network, AgentNetworks) or names[:2] != ["actor", "critic"]:
+        raise ValueError(f'an agent has the networks {names}; allowed: "actor" and "critic"')

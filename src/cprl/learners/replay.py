@@ -1,7 +1,7 @@
-"""Replay: the memory of agents that learn from the latest turns, in any order."""
+"""Replay: the memory of off-policy agents, which learn from the latest turns in any order."""
 
 from collections.abc import Iterator, Mapping
-from typing import Any
+from typing import Any, Final
 
 import torch
 from tensordict import TensorDict
@@ -16,39 +16,51 @@ from cprl.learners.networks import LaneNetworks
 from cprl.learners.refusals import refuse_for_replay
 from cprl.learners.ring import Ring
 from cprl.learners.settings import DQNSettings
-from cprl.learners.transitions import LaneTurn, TransitionForm, made_up
+from cprl.learners.transitions import LaneTurn, TransitionForm, randomized
 from cprl.policies.rng import Purpose
+
+_EXAMPLE_SAMPLES: Final = 8
+"""The samples of each lane in a synthetic batch."""
 
 
 class Replay:
-    """Stores the latest turns in a ring, and gives a batch every `steps_per_update` steps.
+    """A memory that stores the latest turns in a ring, and yields a batch every `steps_per_update` steps.
 
-    Recurrent networks learn from sequences of `sequence_steps` turns, which begin with the states by which
-    agents acted.
+    Recurrent networks learn from sequences of `sequence_steps` turns; each begins with the recurrent state
+    that the agent had when it acted in that turn.
 
     Args:
-        form: what is stored of a turn and sampled.
-        loss: of one lane, which is refused if it cannot learn from replay.
-        stochastic: whether networks output policies; else they output action values.
+        lanes: the agents that learn.
+        settings: say when an update is due, and how large the buffer and its samples are.
+        form: the shapes of what is stored of a turn and sampled.
+        loss: the loss of one lane; refused if it cannot learn from replay.
+        stochastic: true if networks output the logits of a policy; else they output action values.
     """
 
     def __init__(
         self, lanes: Lanes, settings: DQNSettings, form: TransitionForm, loss: LossModule, *, stochastic: bool
     ) -> None:
         settings.refuse_worlds(lanes.worlds)
-        self.lanes, self.settings, self.form, self.stochastic = lanes, settings, form, stochastic
+        self.lanes = lanes
+        self.settings = settings
+        self.form = form
+        self.stochastic = stochastic
         self.sequence_steps = settings.sequence_steps
         self._refuse_other_sequences()
         refuse_for_replay(loss, settings, lambda: self.example(1)[0])
         self.buffer = self._make_buffer()
-        self._steps, self._owed = 0, 0
-        """Steps stored; and those since the last update, of those that count, from `learning_starts` on."""
+        self._steps = 0
+        """The steps stored for each replica; a turn of W worlds is W steps."""
+        self._steps_owed = 0
+        """The steps from `_first_update` on for which no update was taken yet."""
         self._first_update = max(settings.learning_starts, (form.steps_ahead + 1) * lanes.worlds)
-        """The first step that counts, by when each world has stored what a sample reads."""
+        """The step of the first update: `learning_starts`, or the step at which each world has stored enough
+        turns for one sample."""
 
     def _refuse_other_sequences(self) -> None:
-        """Raises a ValueError unless recurrent networks, and they alone, learn from sequences."""
-        steps, is_recurrent = self.sequence_steps, self.form.state_cells > 0
+        """Raise a ValueError unless recurrent networks, and they alone, learn from sequences."""
+        steps = self.sequence_steps
+        is_recurrent = self.form.state_cells > 0
         if is_recurrent != (steps > 1):
             kind, allowed = ("a", "2 or more") if is_recurrent else ("no", "1")
             raise ValueError(
@@ -70,51 +82,58 @@ class Replay:
         )
 
     def write(self, turn: Turn, lane_turn: LaneTurn) -> None:
-        """Stores a turn, as all agents had it, and as these lanes did."""
+        """Store a turn; `Memory.write` says the arguments."""
+        worlds = self.lanes.worlds
         self.buffer.write(lane_turn)
-        self._steps += self.lanes.worlds
-        self._owed += self.lanes.worlds * (self._steps >= self._first_update)
+        self._steps += worlds
+        if self._steps >= self._first_update:
+            self._steps_owed += worlds
 
     def due(self, networks: LaneNetworks) -> Iterator[Draw]:
-        """The batches to learn from after a turn: `updates_per_step` for every `steps_per_update` steps
-        that count; none before the first update and between updates."""
-        every, worlds = self.settings.steps_per_update, self.lanes.worlds
-        # One that updates after every step may do so whenever it asks.
-        updates = worlds if every == 1 else min(self._owed // every, worlds)
+        """Yield the batches of the updates that are due: `updates_per_step` for every `steps_per_update`
+        steps from the first update on."""
+        period = self.settings.steps_per_update
+        worlds = self.lanes.worlds
+        # With an update after every step a caller may ask for updates at any time, also without a new turn.
+        updates = worlds if period == 1 else min(self._steps_owed // period, worlds)
         if self._steps < self._first_update or not updates:
             return
-        self._owed = max(0, self._owed - every * updates)
+        self._steps_owed = max(0, self._steps_owed - period * updates)
         for _ in range(updates * self.settings.updates_per_step):
             yield self.buffer.draw()
 
     def example(self, lanes: int) -> TensorDict:
-        """A made-up batch of so many lanes, in the form of those that are due, [lanes, 8]."""
+        """Return a synthetic batch of a number of lanes, [lanes, 8], in the shapes of those that are due."""
         form = self.form
-        turns = 8 + form.steps_ahead
+        turns = _EXAMPLE_SAMPLES + form.steps_ahead
         seeds = [(lane,) for lane in range(lanes)]
-        ring = Ring(form, seeds=seeds, transitions=turns, batch_size=8, device=self.lanes.device)
-        places = torch.arange(8, device=ring.device).expand(lanes, -1)
+        ring = Ring(
+            form, seeds=seeds, transitions=turns, batch_size=_EXAMPLE_SAMPLES, device=self.lanes.device
+        )
+        places = torch.arange(_EXAMPLE_SAMPLES, device=ring.device).expand(lanes, -1)
         batch = ring.get(places)
         if form.noise_shape:
             batch.set("noise", torch.zeros(*batch.batch_size, *form.noise_shape, device=ring.device))
-        return made_up(batch, self.lanes.spaces.actions)
+        return randomized(batch, self.lanes.spaces.actions)
 
     def values(self, networks: LaneNetworks, turn: Turn) -> Tensor:
-        """The highest action value at the end of a turn, [L, W, ..]; NaN where a network outputs a policy."""
+        """Return the highest action value after a turn, [L, W, ..]; NaN for networks that output a policy."""
         if self.stochastic:
             return torch.full((len(self.lanes), self.lanes.worlds, *self.lanes.members), torch.nan)
         cells = self.form.state_cells
         states = [self.lanes.by_lane(self.lanes.states(turn, recurrent_state.AFTER, cells))] if cells else []
-        outputs = networks.outputs(self.lanes.seen_next(turn), *states)
-        return (outputs[0] if cells else outputs).amax(-1)  # type: ignore[no-any-return]
+        outputs = networks.outputs(self.lanes.next_observations(turn), *states)
+        return (outputs[0] if cells else outputs).amax(-1)
 
     def cut(self, networks: LaneNetworks) -> None:
-        """Ends the episodes that a training left unfinished: what is stored next does not follow them."""
+        """End the episodes that a training left unfinished: the next turn that is stored does not follow
+        them."""
         self.buffer.cut()
 
     def state_dict(self) -> dict[str, Any]:
-        return {**self.buffer.state_dict(), "steps": self._steps, "owed": self._owed}
+        return {**self.buffer.state_dict(), "steps": self._steps, "owed": self._steps_owed}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         self.buffer.load_state_dict(state)
-        self._steps, self._owed = int(state["steps"]), int(state["owed"])
+        self._steps = int(state["steps"])
+        self._steps_owed = int(state["owed"])

@@ -1,4 +1,4 @@
-"""Rollouts: the memory of on-policy agents, which learn from the latest turns of their present policies."""
+"""Rollouts: the memory of on-policy agents, which learn from the turns of their current policies alone."""
 
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
@@ -15,25 +15,31 @@ from cprl.learners.draw import Draw
 from cprl.learners.lanes import Lanes
 from cprl.learners.networks import LaneNetworks
 from cprl.learners.refusals import reads, refuse_other_advantages
-from cprl.learners.ring import steps_ahead
+from cprl.learners.ring import steps_per_block
 from cprl.learners.settings import LOLASettings, RolloutSettings
-from cprl.learners.transitions import LaneTurn, TransitionForm, made_up, refuse_other_dtype
-from cprl.networks.agent import parts_of
+from cprl.learners.transitions import LaneTurn, TransitionForm, randomized, refuse_other_dtype
+from cprl.networks.agent import networks_by_name
 from cprl.networks.recurrent import state_shape_of
 from cprl.policies.rng import LaneRng, Purpose
 
 ACTOR, CRITIC = range(2)
-"""Positions of the actor and the critic among an agent's networks."""
+"""The indices of the actor and the critic among an agent's networks."""
 
-NAMES = "recurrent_state", "critic_recurrent_state"
-"""The entries of the states before each step, of the actor and the critic, in the batches of losses."""
+STATE_NAMES: Final = ("recurrent_state", "critic_recurrent_state")
+"""The entries of batches with the recurrent states before each step, of the actor and of the critic."""
 
 _SMALL: Final = 1e-8
+"""Added to the standard deviation by which advantages are divided."""
 
 
 def state_shapes(network: nn.Module) -> dict[str, tuple[int, ...]]:
-    """The shapes of the states of actor and critic by their entries; empty for networks without."""
-    parts = list(parts_of(network).items())[:2]
+    """Return the shapes of the recurrent states of actor and critic, by their entries in `STATE_NAMES`; empty
+    if neither is recurrent.
+
+    Raises:
+        ValueError: if only one of them is recurrent.
+    """
+    parts = list(networks_by_name(network).items())[:2]
     shapes = [state_shape_of(part) for _, part in parts]
     if all(shape is None for shape in shapes):
         return {}
@@ -42,83 +48,103 @@ def state_shapes(network: nn.Module) -> dict[str, tuple[int, ...]]:
             raise ValueError(
                 f'the "{name}" is not recurrent; allowed beside a network that is: a GRU or an LSTM'
             )
-    return {name: shape for name, shape in zip(NAMES, shapes, strict=True) if shape is not None}
+    return {name: shape for name, shape in zip(STATE_NAMES, shapes, strict=True) if shape is not None}
 
 
 class States:
-    """The states of recurrent actors and critics of L lanes in W worlds, from one rollout to the next.
+    """The recurrent states of the actors and critics of L lanes in W worlds, from one rollout to the next.
 
-    The actor's first state of a rollout is the one by which it acted; that of the critic, which does not act,
-    is what it had after the rollout before. Gradients run through the `sequence` turns of a minibatch, which
-    begin with the states that the rollout had there: the stored states of Kapturowski et al., "Recurrent
-    Experience Replay in Distributed Reinforcement Learning" (2019).
+    A rollout begins with the actor's state when it acted in the first turn, and with the critic's state after
+    the rollout before, since critics do not act. Each sequence of a minibatch begins with the states that the
+    rollout has in its first turn: the stored states of Kapturowski et al., "Recurrent Experience Replay in
+    Distributed Reinforcement Learning" (2019). Gradients run through one sequence.
 
     Args:
-        sequence: consecutive turns T' of a minibatch.
+        shapes: see `state_shapes`.
+        sequence_steps: the consecutive turns T' of a sequence.
     """
 
-    def __init__(self, shapes: Mapping[str, tuple[int, ...]], lanes: Lanes, *, sequence: int) -> None:
-        self._lanes, self._sequence, device = lanes, sequence, lanes.device
+    def __init__(self, shapes: Mapping[str, tuple[int, ...]], lanes: Lanes, *, sequence_steps: int) -> None:
+        self._lanes = lanes
+        self._sequence_steps = sequence_steps
+        device = lanes.device
         self.shapes = shapes
         size = len(lanes), lanes.worlds
         self._first = {name: torch.zeros(*size, *shape, device=device) for name, shape in shapes.items()}
+        """The states before the first turn of the rollout, [L, W, *shape], by `STATE_NAMES`."""
         self._ended = torch.ones(size, dtype=torch.bool, device=device)
-        """Whether the episode ended with the last turn of the rollout before."""
+        """Marks the worlds whose episode ended with the last turn of the rollout before, [L, W]."""
 
     def forget(self) -> None:
-        """The next rollout begins with new episodes."""
+        """Begin the next rollout with new episodes."""
         self._ended.fill_(True)
 
     def begin(self, turn: Turn) -> None:
-        """Notes by which states agents act in the first turn of a rollout."""
-        first = self._first[NAMES[ACTOR]]
+        """Store the states with which agents act in the first turn of a rollout."""
+        first = self._first[STATE_NAMES[ACTOR]]
         first.copy_(self._lanes.by_lane(self._lanes.states(turn, recurrent_state.BEFORE, first.shape[-1])))
 
     def evaluate(
         self, networks: LaneNetworks, columns: Mapping[str, Tensor]
     ) -> tuple[Tensor, Tensor, Tensor, dict[str, Tensor]]:
-        """The logits, values and next values of a full rollout, [L, W, T, ...], and what losses read besides:
-        the states before each turn, and "is_init". Keeps the critic's states for the next rollout."""
-        began, states = self._began(columns["done"]), {}
-        logits, states[NAMES[ACTOR]], _ = self._in_order(networks, columns, began, ACTOR)
-        value, states[NAMES[CRITIC]], after = self._in_order(networks, columns, began, CRITIC)
-        next_value, _ = networks.outputs(columns["next_observation"], after, part=CRITIC)
-        self._first[NAMES[CRITIC]].copy_(after[:, :, -1])
+        """Evaluate actor and critic on a full rollout; keep the critic's last states for the next rollout.
+
+        Returns:
+            Logits, values and next values, [L, W, T, ...], and the entries that losses of recurrent networks
+            read besides: the states before each turn, and "is_init".
+        """
+        actor, critic = STATE_NAMES
+        begins = self._mark_begins(columns["done"])
+        logits, actor_states, _ = self._run_network(networks, columns, begins, ACTOR)
+        value, critic_states, states_after = self._run_network(networks, columns, begins, CRITIC)
+        next_value, _ = networks.outputs(columns["next_observation"], states_after, part=CRITIC)
+        self._first[critic].copy_(states_after[:, :, -1])
         self._ended.copy_(columns["done"][..., -1])
-        is_init = began.clone()
-        is_init[..., :: self._sequence] = True
-        return logits, value, next_value, {**states, "is_init": is_init}
+        is_init = begins.clone()
+        is_init[..., :: self._sequence_steps] = True
+        return logits, value, next_value, {actor: actor_states, critic: critic_states, "is_init": is_init}
 
-    def value_next(
-        self, networks: LaneNetworks, columns: Mapping[str, Tensor], size: int, seen_next: Tensor
+    def next_value(
+        self, networks: LaneNetworks, columns: Mapping[str, Tensor], turns: int, next_observation: Tensor
     ) -> Tensor:
-        """The value of the state after the latest of `size` turns, 0 directly after a rollout, from the
-        observations after it, [L, W, ...]."""
-        after = self._first[NAMES[CRITIC]]
-        if size:
-            so_far = {name: column[:, :, :size] for name, column in columns.items()}
-            _, _, each = self._in_order(networks, so_far, self._began(so_far["done"]), CRITIC)
-            after = each[:, :, -1]
-        value: Tensor = networks.outputs(seen_next, after, part=CRITIC)[0]
-        return value
+        """Return the value of the state after the latest turn, [L, W, 1].
 
-    def _began(self, done: Tensor) -> Tensor:
-        """Whether an episode begins with a turn, bool [L, W, T]."""
+        Args:
+            columns: the fields of the rollout, [L, W, T, ...].
+            turns: the turns of the rollout so far; 0 directly after the rollout before.
+            next_observation: what lanes observe after the latest turn, [L, W, ...].
+        """
+        states = self._first[STATE_NAMES[CRITIC]]
+        if turns:
+            played = {name: column[:, :, :turns] for name, column in columns.items()}
+            _, _, states_after = self._run_network(
+                networks, played, self._mark_begins(played["done"]), CRITIC
+            )
+            states = states_after[:, :, -1]
+        return networks.outputs(next_observation, states, part=CRITIC)[0]
+
+    def _mark_begins(self, done: Tensor) -> Tensor:
+        """Return which turns begin an episode, bool [L, W, T]."""
         return torch.cat([self._ended.unsqueeze(-1), done[..., :-1]], -1)
 
-    def _in_order(
-        self, networks: LaneNetworks, columns: Mapping[str, Tensor], began: Tensor, part: int
+    def _run_network(
+        self, networks: LaneNetworks, columns: Mapping[str, Tensor], begins: Tensor, part: int
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """The outputs of a network, its states before each turn and after it, [L, W, T, ...]."""
-        observation, first = columns["observation"], self._first[NAMES[part]]
-        given = first.new_zeros(*observation.shape[:3], *first.shape[2:])
-        given[:, :, 0] = torch.where(_like(began[..., 0], first), 0.0, first)
-        is_init = began.clone()
+        """Run a recurrent network over a rollout, turn by turn.
+
+        Returns:
+            Its outputs, its states before each turn, and its states after each turn, [L, W, T, ...].
+        """
+        observation = columns["observation"]
+        first = self._first[STATE_NAMES[part]]
+        states = first.new_zeros(*observation.shape[:3], *first.shape[2:])
+        states[:, :, 0] = torch.where(_add_axes(begins[..., 0], first), 0.0, first)
+        is_init = begins.clone()
         is_init[..., 0] = True
-        outputs, after = networks.outputs(observation, given, is_init, part=part)
-        begins, later = began[..., 1:], after[:, :, :-1]
-        before = torch.cat([given[:, :, :1], torch.where(_like(begins, later), 0.0, later)], 2)
-        return outputs, before, after
+        outputs, states_after = networks.outputs(observation, states, is_init, part=part)
+        earlier = states_after[:, :, :-1]
+        carried = torch.where(_add_axes(begins[..., 1:], earlier), 0.0, earlier)
+        return outputs, torch.cat([states[:, :, :1], carried], 2), states_after
 
     def state_dict(self) -> dict[str, Tensor]:
         return {**self._first, "ended": self._ended}
@@ -129,147 +155,178 @@ class States:
 
 
 class Rollouts:
-    """Stores the turns since the last update; once T = `rollout_steps` are there, it gives minibatches of all
-    T x W steps, for `epochs` epochs, with advantages by TorchRL's GAE.
+    """A memory of the turns since the last update.
 
-    Each lane shuffles its own minibatches. Those of recurrent networks are consecutive turns of one world,
-    or, where they are larger than a rollout, the rollouts of several worlds.
+    When it has T = `rollout_steps` turns, it computes advantages by TorchRL's GAE and yields minibatches of
+    all T x W steps, for `epochs` epochs. Each lane shuffles its own steps. A minibatch of recurrent networks
+    is a sequence of consecutive turns of one world, or, if it is larger than a rollout, the rollouts of
+    several worlds.
 
     Args:
-        network: of one lane, an "actor" and a "critic", see `cprl.algorithms.OnPolicy`.
-        loss: of one lane, which is refused if it needs other advantages.
+        lanes: the agents that learn.
+        settings: say when an update is due, and how advantages and minibatches are made.
+        network: the networks of one lane, an "actor" and a "critic", see `cprl.algorithms.OnPolicy`.
+        loss: the loss of one lane; refused if it needs other advantages.
     """
 
     def __init__(self, lanes: Lanes, settings: RolloutSettings, network: nn.Module, loss: LossModule) -> None:
         settings.refuse_worlds(lanes.worlds)
         refuse_other_advantages(loss, settings)
-        self.lanes, self.settings = lanes, settings
+        self.lanes = lanes
+        self.settings = settings
         self._reads_logits = reads(loss, "logits")
         shapes = state_shapes(network)
         turns = min(settings.minibatch_size, settings.rollout_steps)
         self.sequence_steps = turns if shapes else 1
-        """Consecutive turns T' of a minibatch of recurrent networks."""
-        cells = shapes[NAMES[ACTOR]][-1] if shapes else 0
+        """The consecutive turns T' of each sequence; 1 if no network is recurrent."""
+        cells = shapes[STATE_NAMES[ACTOR]][-1] if shapes else 0
         self.form = lanes.form(state_cells=cells, has_in_play=settings.only_in_play)
-        self.states = States(shapes, lanes, sequence=turns) if shapes else None
+        self.states = States(shapes, lanes, sequence_steps=turns) if shapes else None
         self.rollout = Rollout(lanes, settings.rollout_steps, self.form)
         steps = settings.rollout_steps * lanes.worlds
-        self.rng = LaneRng(lanes.seeds(Purpose.SAMPLING), steps, ahead=steps_ahead(steps))
+        self.rng = LaneRng(lanes.seeds(Purpose.SAMPLING), steps, ahead=steps_per_block(steps))
 
     def write(self, turn: Turn, lane_turn: LaneTurn) -> None:
-        """Stores a turn, as all agents had it, and as these lanes did."""
+        """Store a turn; `Memory.write` says the arguments."""
         self.rollout.refuse_full()
         if self.states is not None and not self.rollout.size:
             self.states.begin(turn)
         self.rollout.write(lane_turn)
 
     def due(self, networks: LaneNetworks) -> Iterator[Draw]:
-        """The minibatches of all epochs over a full rollout; none while it is not full."""
+        """Yield the minibatches of all epochs if the rollout is full; then begin the next one."""
         if not self.rollout.is_full:
             return
         batch = self._batch(networks)
         for _ in range(self.settings.epochs):
-            for place in self._minibatches(self.rng.next()).to(batch["action"].device):
-                yield Draw.of(batch, place)
+            for index in self._minibatches(self.rng.next()).to(batch["action"].device):
+                yield Draw.of(batch, index)
         self.rollout.size = 0
 
     def example(self, lanes: int) -> TensorDict:
-        """A made-up minibatch of so many lanes, in the form of those that are due."""
-        settings, form = self.settings, self.form
+        """Return a synthetic minibatch of a number of lanes, in the shapes of those that `due` yields."""
+        settings = self.settings
+        form = self.form
         steps = min(settings.minibatch_size, settings.rollout_steps * self.lanes.worlds)
         size = [lanes, steps if self.states is None else self.sequence_steps]
 
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(*size, *shape, dtype=dtype, device=self.lanes.device)
 
-        members, actions = form.action_shape, self.lanes.spaces.actions
+        members = form.action_shape
+        actions = self.lanes.spaces.actions
         entries = {
             "observation": zeros(*form.observation_shape, dtype=form.dtype),
             "action": zeros(*members, dtype=torch.int64),
             "action_log_prob": zeros(*members),
             **{name: zeros(*members, 1) for name in ("advantage", "value_target", "state_value")},
-            **({"logits": zeros(*members, actions)} if self._reads_logits else {}),
-            **({"in_play": ~zeros(*members, dtype=torch.bool)} if form.has_in_play else {}),
-            **(
-                {}
-                if self.states is None
-                else {name: zeros(*shape) for name, shape in self.states.shapes.items()}
-            ),
-            **({} if self.states is None else {"is_init": zeros(dtype=torch.bool)}),
         }
-        return made_up(TensorDict(entries, size), actions)
+        if self._reads_logits:
+            entries["logits"] = zeros(*members, actions)
+        if form.has_in_play:
+            entries["in_play"] = ~zeros(*members, dtype=torch.bool)
+        if self.states is not None:
+            entries |= {name: zeros(*shape) for name, shape in self.states.shapes.items()}
+            entries["is_init"] = zeros(dtype=torch.bool)
+        return randomized(TensorDict(entries, size), actions)
 
     def _minibatches(self, numbers: Tensor) -> Tensor:
-        """The steps of an epoch's minibatches, int64 [minibatches, L, size], from random numbers [L, W x T];
-        of recurrent networks T' consecutive turns, [minibatches, L, T'], or several such sequences of each
-        lane, [minibatches, L, sequences, T']."""
-        size, turns = self.settings.minibatch_size, self.sequence_steps
+        """Return the steps of each minibatch of an epoch.
+
+        Args:
+            numbers: random numbers of the steps of each lane, [L, W x T], whose order is that of the epoch.
+
+        Returns:
+            int64 [minibatches, L, minibatch_size]; with recurrent networks [minibatches, L, T'], or
+            [minibatches, L, sequences, T'] if a minibatch has several sequences of each lane.
+        """
+        size = self.settings.minibatch_size
+        turns = self.sequence_steps
         if self.states is None:
             return numbers.argsort(-1).view(len(numbers), -1, size).transpose(0, 1)
         sequences = numbers[:, ::turns].argsort(-1).view(len(numbers), -1, size // turns).transpose(0, 1)
-        places = sequences.unsqueeze(-1) * turns + torch.arange(turns)
-        return places.squeeze(2)
+        steps = sequences.unsqueeze(-1) * turns + torch.arange(turns)
+        return steps.squeeze(2)
 
     @torch.no_grad()
     def _batch(self, networks: LaneNetworks) -> TensorDict:
-        """The rollout with advantages, [L, W x T], under the keys of TorchRL's losses; advantages are
-        normalised within each lane if the settings say so."""
+        """Return the rollout with advantages, [L, W x T], under the keys of TorchRL's losses.
+
+        If the settings say so, advantages are normalised within each lane.
+        """
         columns = self.rollout.fields
         entries: dict[str, Tensor] = {}
         if self.states is not None:
             logits, value, next_value, entries = self.states.evaluate(networks, columns)
         else:
-            logits, value, next_value = self._evaluated(networks)
-        over = tuple(range(1, value.ndim))
-        options: dict[str, Any] = {"settings": self.settings, "over": over, "time_dim": 2}
-        advantage, target = advantages(columns, value, next_value, **options)
-        chosen = logits.log_softmax(-1).gather(-1, columns["action"].unsqueeze(-1)).squeeze(-1)
-        read = {
+            logits, value, next_value = self._evaluate(networks)
+        all_but_lanes = tuple(range(1, value.ndim))
+        advantage, target = advantages(
+            columns, value, next_value, settings=self.settings, over=all_but_lanes, time_dim=2
+        )
+        log_probs = logits.log_softmax(-1).gather(-1, columns["action"].unsqueeze(-1)).squeeze(-1)
+        entries |= {
             "observation": columns["observation"],
             "action": columns["action"],
-            "action_log_prob": chosen,
+            "action_log_prob": log_probs,
             "advantage": advantage,
             "value_target": target,
             "state_value": value,
-            **({"logits": logits} if self._reads_logits else {}),
-            **({"in_play": columns["in_play"]} if self.form.has_in_play else {}),
-            **entries,
         }
+        if self._reads_logits:
+            entries["logits"] = logits
+        if self.form.has_in_play:
+            entries["in_play"] = columns["in_play"]
         size = [len(self.lanes), self.lanes.worlds * self.settings.rollout_steps]
-        return TensorDict({name: entry.flatten(1, 2) for name, entry in read.items()}, size)
+        return TensorDict({name: entry.flatten(1, 2) for name, entry in entries.items()}, size)
 
-    def _evaluated(self, networks: LaneNetworks) -> tuple[Tensor, Tensor, Tensor]:
-        """The logits, values and next values of a full rollout, [L, W, T, ...]."""
+    def _evaluate(self, networks: LaneNetworks) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the logits, values and next values of a full rollout, [L, W, T, ...]."""
         columns = self.rollout.fields
-        seen, following = (columns[name].flatten(1, 2) for name in ("observation", "next_observation"))
+        observation = columns["observation"].flatten(1, 2)
+        next_observation = columns["next_observation"].flatten(1, 2)
         done = columns["done"]
-        if self.lanes.worlds == 1:  # in one piece, since products of other shapes round in other ways
-            logits, value = (networks.outputs(seen, part=part) for part in (ACTOR, CRITIC))
-            next_value = networks.outputs(following, part=CRITIC)
-        else:  # in pieces that stay in the processor's caches
-            pieces = torch.split(seen, self.settings.minibatch_size, 1)
-            given = [networks.outputs_of_both(piece) for piece in pieces]
-            logits, value = (torch.cat(each, 1) for each in zip(*given, strict=True))
-            # What is seen after a turn is seen before the next one, but where an episode or the rollout ends.
-            next_value, ends = value.roll(-1, 1), done.clone()
-            ends[:, :, -1] = True
-            place = _places(ends.flatten(1))
-            lane = torch.arange(len(place), device=place.device)[:, None]
-            next_value[lane, place] = networks.outputs(following[lane, place], part=CRITIC)
-        by_turn = (entry.reshape(*done.shape, *entry.shape[2:]) for entry in (logits, value, next_value))
-        logits, value, next_value = by_turn
+        if self.lanes.worlds == 1:
+            # In one piece: a matrix product of another shape rounds differently.
+            logits = networks.outputs(observation, part=ACTOR)
+            value = networks.outputs(observation, part=CRITIC)
+            next_value = networks.outputs(next_observation, part=CRITIC)
+        else:
+            # In pieces that fit into the processor's caches.
+            pieces = torch.split(observation, self.settings.minibatch_size, 1)
+            outputs = [networks.outputs_of_both(piece) for piece in pieces]
+            logits, value = (torch.cat(piece_outputs, 1) for piece_outputs in zip(*outputs, strict=True))
+            next_value = self._shift_values(networks, value, next_observation, done)
+        logits, value, next_value = (
+            entry.reshape(*done.shape, *entry.shape[2:]) for entry in (logits, value, next_value)
+        )
         return logits, value, next_value
 
+    def _shift_values(
+        self, networks: LaneNetworks, value: Tensor, next_observation: Tensor, done: Tensor
+    ) -> Tensor:
+        """Return the values of the states after each step, [L, W x T, ...], from those before each step.
+
+        The state after a step is the state before the next one, so its value is known; except where an
+        episode or the rollout ends, where the critic computes it.
+        """
+        next_value = value.roll(-1, 1)
+        ends = done.clone()
+        ends[:, :, -1] = True
+        step = _marked_indices(ends.flatten(1))
+        lane = torch.arange(len(step), device=step.device)[:, None]
+        next_value[lane, step] = networks.outputs(next_observation[lane, step], part=CRITIC)
+        return next_value
+
     def values(self, networks: LaneNetworks, turn: Turn) -> Tensor:
-        """The value of the state after a turn, [L, W, .., 1]."""
-        seen = self.lanes.seen_next(turn)
+        """Return the value of the state after a turn, [L, W, .., 1]."""
+        next_observation = self.lanes.next_observations(turn)
         if self.states is None:
-            value: Tensor = networks.outputs(seen, part=CRITIC)
-            return value
-        return self.states.value_next(networks, self.rollout.fields, self.rollout.size, seen)
+            return networks.outputs(next_observation, part=CRITIC)
+        return self.states.next_value(networks, self.rollout.fields, self.rollout.size, next_observation)
 
     def cut(self, networks: LaneNetworks) -> None:
-        """Drops the rollout that a training left unfinished."""
+        """Drop the rollout that a training left unfinished."""
         self.rollout.size = 0
         if self.states is not None:
             self.states.forget()
@@ -285,12 +342,15 @@ class Rollouts:
             self.states.load_state_dict(state["recurrent"])
 
 
-def _places(marked: Tensor) -> Tensor:
-    """Where each row has a mark, int64 [L, m] of bool [L, n]; of rows with fewer marks the last one again."""
+def _marked_indices(marked: Tensor) -> Tensor:
+    """Return the indices of the marks in each row of a bool tensor [L, n], int64 [L, m].
+
+    m is the number of marks in the row with most; rows with fewer repeat their last index.
+    """
     order = marked.byte().argsort(dim=1, descending=True, stable=True)
     counts = marked.sum(1, keepdim=True)
-    at = torch.arange(int(counts.max()), device=marked.device)
-    return order.gather(1, at.minimum(counts - 1))
+    ordinal = torch.arange(int(counts.max()), device=marked.device)
+    return order.gather(1, ordinal.minimum(counts - 1))
 
 
 def advantages(
@@ -302,91 +362,109 @@ def advantages(
     time_dim: int,
     over: tuple[int, ...],
 ) -> tuple[Tensor, Tensor]:
-    """The advantage of each step, and the target of its value, both of the shape of `value`.
+    """Return the advantage of each step and the target of its value, both in the shape of `value`.
 
     Args:
-        columns: "reward", "done" and "terminated", of lanes [L, .., T], or of members of teams [L, .., T, S];
-            and "in_play", likewise, if advantages are normalised by those of turns in play.
-        value: of the states before each step, [L, .., T, .., 1].
-        next_value: of the states after it.
+        columns: "reward", "done" and "terminated", [L, .., T], or [L, .., T, S] for members of teams; also
+            "in_play", of the same shape, if only advantages of turns in play count for the normalisation.
+        value: the values of the states before each step, [L, .., T, .., 1].
+        next_value: the values of the states after each step, in the same shape.
         settings: the discount, lambda, and whether advantages are normalised.
         time_dim: the axis of time.
-        over: the axes over which they are normalised.
+        over: the axes over which advantages are normalised.
     """
     advantage, target = generalized_advantage_estimate(
         settings.gamma,
         settings.gae_lambda,
         value,
         next_value,
-        *(_like(columns[name], value).expand_as(value) for name in ("reward", "done", "terminated")),
+        *(_add_axes(columns[name], value).expand_as(value) for name in ("reward", "done", "terminated")),
         time_dim=time_dim,
     )
     if settings.normalize_advantage:
-        mean, spread = _mean_and_spread(advantage, columns.get("in_play"), over)
-        advantage = (advantage - mean) / (spread + _SMALL)
+        mean, deviation = _mean_and_deviation(advantage, columns.get("in_play"), over)
+        advantage = (advantage - mean) / (deviation + _SMALL)
     return advantage, target
 
 
-def _mean_and_spread(values: Tensor, counted: Tensor | None, over: tuple[int, ...]) -> tuple[Tensor, Tensor]:
-    """The mean and standard deviation over some axes, which stay with size 1; of marked values alone."""
+def _mean_and_deviation(
+    values: Tensor, counted: Tensor | None, over: tuple[int, ...]
+) -> tuple[Tensor, Tensor]:
+    """Return the mean and the standard deviation of values over some axes, which stay with size 1.
+
+    Args:
+        counted: marks the values that count, bool; None if all do.
+        over: the axes.
+    """
     if counted is None:
         return values.mean(over, keepdim=True), values.std(over, keepdim=True)
-    counts = _like(counted, values).expand_as(values)
-    number = counts.sum(over, keepdim=True)
-    mean = torch.where(counts, values, 0.0).sum(over, keepdim=True) / number.clamp(min=1)
-    squares = torch.where(counts, (values - mean).square(), 0.0).sum(over, keepdim=True)
-    return mean, (squares / (number - 1).clamp(min=1)).sqrt()
+    is_counted = _add_axes(counted, values).expand_as(values)
+    count = is_counted.sum(over, keepdim=True)
+    mean = torch.where(is_counted, values, 0.0).sum(over, keepdim=True) / count.clamp(min=1)
+    squares = torch.where(is_counted, (values - mean).square(), 0.0).sum(over, keepdim=True)
+    return mean, (squares / (count - 1).clamp(min=1)).sqrt()
 
 
-def _like(column: Tensor, value: Tensor) -> Tensor:
-    """A field of lanes [L, ...] with axes of size 1 for those of values [L, ..., H] that it lacks."""
+def _add_axes(column: Tensor, value: Tensor) -> Tensor:
+    """Append axes of size 1 to a tensor [L, ...] until it has as many axes as another, [L, ..., H]."""
     return column.reshape(*column.shape, *[1] * (value.ndim - column.ndim))
 
 
 class Rollout:
-    """The turns of a rollout of all lanes in their worlds, field by field as of a `LaneTurn`.
+    """The stored turns of one rollout, or several, of all lanes in their worlds, by the fields of `LaneTurn`.
 
     Args:
-        steps: T, of one rollout.
-        form: what is stored of a turn.
-        rollouts: P, those that are kept at once; by default one, without an axis of its own.
+        steps: the turns T of a rollout.
+        form: the shapes of what is stored of a turn.
+        rollouts: the number P of rollouts that are kept at once, along a first axis; None for one without
+            this axis.
     """
 
     def __init__(self, lanes: Lanes, steps: int, form: TransitionForm, rollouts: int | None = None) -> None:
-        device, self._lanes = lanes.device, lanes
-        axes = (*(() if rollouts is None else (rollouts,)), len(lanes), lanes.worlds, steps)
-        forms: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
+        self._lanes = lanes
+        rollout_axis = () if rollouts is None else (rollouts,)
+        axes = (*rollout_axis, len(lanes), lanes.worlds, steps)
+        shapes: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
             "observation": (form.observation_shape, form.dtype),
             "action": (form.action_shape, torch.int64),
             "next_observation": (form.observation_shape, form.dtype),
             "reward": (form.reward_shape, torch.float32),
             "done": ((), torch.bool),
             "terminated": ((), torch.bool),
-            **({"in_play": (form.action_shape, torch.bool)} if form.has_in_play else {}),
         }
+        if form.has_in_play:
+            shapes["in_play"] = (form.action_shape, torch.bool)
         self.fields = {
-            name: torch.zeros((*axes, *shape), dtype=dtype, device=device)
-            for name, (shape, dtype) in forms.items()
+            name: torch.zeros((*axes, *shape), dtype=dtype, device=lanes.device)
+            for name, (shape, dtype) in shapes.items()
         }
-        """[L, W, T, ...], or [P, L, W, T, ...]."""
-        self.steps, self.size = steps, 0
+        """The stored turns, [L, W, T, ...], or [P, L, W, T, ...]."""
+        self.steps = steps
+        self.size = 0
+        """The turns of the current rollout that are stored."""
 
     @property
     def is_full(self) -> bool:
+        """Return whether all turns of the rollout are stored."""
         return self.size == self.steps
 
     def refuse_full(self) -> None:
+        """Raise a ValueError if there is no room for another turn."""
         if self.is_full:
             raise ValueError(f"the rollout already has {self.steps} steps; call update() before store()")
 
-    def write(self, turn: LaneTurn, *rollout: int) -> None:
-        """Writes the next turn, of a rollout if several are kept."""
+    def write(self, turn: LaneTurn, rollout: int | None = None) -> None:
+        """Write the next turn.
+
+        Args:
+            rollout: the index of the rollout if several are kept; None for one.
+        """
         for name, field in self.fields.items():
             column = getattr(turn, name)
             if name in ("observation", "next_observation"):
                 refuse_other_dtype(torch.as_tensor(column).dtype, field.dtype)
-            of_rollout = field[rollout] if rollout else field
-            of_rollout[:, :, self.size] = self._lanes.by_lane(column)
+            rollout_field = field if rollout is None else field[rollout]
+            rollout_field[:, :, self.size] = self._lanes.by_lane(column)
         self.size += 1
 
     def state_dict(self) -> dict[str, Any]:

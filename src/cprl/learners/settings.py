@@ -7,7 +7,7 @@ import numpy as np
 
 from cprl.networks.mlp import Layers
 from cprl.values import MOST_INT64, Natural, Positive, Range, Share, Steps, Value
-from cprl.values.arrays import Float64, Int64
+from cprl.values.array_types import Float64, Int64
 
 Optimizer = Literal["adam", "adamw", "rmsprop", "keras_rmsprop", "sgd"]
 """Optimisers of `torch.optim` with torch's defaults; "keras_rmsprop" is `torch.optim.RMSprop` with the decay
@@ -22,11 +22,11 @@ LearningRate = Annotated[float, Range(1e-12, 100)]
 OptimizerEps = Annotated[float, Range(1e-30, 1)]
 NormLimit = Annotated[float, Range(1e-6, 1e12)] | None
 LongSteps = Annotated[int, Range(0, MOST_INT64)]
-Turns = Annotated[int, Range(1, 1000)]
+ReturnSteps = Annotated[int, Range(1, 1000)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Exploring(Value, stored=False):
+class EpsilonGreedy(Value, stored=False):
     """Epsilon-greedy exploration: the probability of a random action is held, then decays linearly."""
 
     epsilon_start: Share = 1.0
@@ -36,38 +36,37 @@ class Exploring(Value, stored=False):
     epsilon_hold_steps: LongSteps = 800
     """Steps at `epsilon_start` before the decay; a turn of W worlds is W steps."""
     epsilon_decay_steps: Steps = 500_000
-    """Steps of the linear decay after the hold, likewise."""
+    """Steps of the linear decay after the hold; a turn of W worlds is W steps."""
     epsilon_evaluation: Share = 0.05
     """Probability of a random action in evaluation."""
 
     def epsilon(self, step: int) -> float:
-        """The probability of a random action at a step, counted from 0."""
-        done = min(1.0, max(0.0, (step - self.epsilon_hold_steps) / self.epsilon_decay_steps))
-        return self.epsilon_start + done * (self.epsilon_end - self.epsilon_start)
+        """Return the probability of a random action at a step, counted from 0."""
+        decayed_share = min(1.0, max(0.0, (step - self.epsilon_hold_steps) / self.epsilon_decay_steps))
+        return self.epsilon_start + decayed_share * (self.epsilon_end - self.epsilon_start)
 
 
 @dataclass(frozen=True, kw_only=True)
-class Falling(Value, stored=False):
-    """A learning rate that can change while an agent learns, along a line: it falls, or rises if its end is
-    above its start."""
+class LearningRateDecay(Value, stored=False):
+    """A learning rate that is constant, or changes linearly from one value to another."""
 
     learning_rate: LearningRate
     """The optimiser's step size."""
     learning_rate_end: Annotated[float, Range(0, 100)] | None = None
-    """The optimiser's step size at the end of the line; None for one that stays as it is."""
+    """The optimiser's step size after the linear change; None for a constant one."""
     learning_rate_decay_steps: Steps = 1_000_000
-    """Environment steps of the line, from the first one on; a turn of W worlds is W steps."""
+    """Environment steps of the linear change, from the first step on; a turn of W worlds is W steps."""
 
     def learning_rate_at(self, step: int) -> float:
-        """The optimiser's step size at a step, counted from 0."""
+        """Return the optimiser's step size at a step, counted from 0."""
         if self.learning_rate_end is None:
             return self.learning_rate
-        done = min(1.0, step / self.learning_rate_decay_steps)
-        return self.learning_rate + done * (self.learning_rate_end - self.learning_rate)
+        decayed_share = min(1.0, step / self.learning_rate_decay_steps)
+        return self.learning_rate + decayed_share * (self.learning_rate_end - self.learning_rate)
 
 
 @dataclass(frozen=True, kw_only=True)
-class DQNSettings(Exploring, Falling):
+class DQNSettings(EpsilonGreedy, LearningRateDecay):
     """Hyperparameters of one independent DQN agent; the defaults are the published ones.
 
     Source: M. Wiatrak, "Governing the Commons with Multi-Agent Reinforcement Learning" (2019), appendix A,
@@ -75,15 +74,15 @@ class DQNSettings(Exploring, Falling):
     """
 
     buffer_size: Annotated[int, Range(1, 2**40 - 1)] = 100_000
-    """Capacity of the replay buffer, in transitions of all worlds of a replica; of W worlds the largest
-    multiple of W is used."""
+    """Capacity of the replay buffer, in transitions of all worlds of a replica. In W worlds the largest
+    multiple of W up to this number is used."""
     batch_size: Positive = 8
     """Transitions in a minibatch, or sequences of `sequence_steps` transitions."""
     learning_starts: Steps = 16
-    """Transitions stored before steps count for updates: `updates_per_step` updates follow every
-    `steps_per_update` of them, the last of these included. So the first update comes at this step, or with
-    `steps_per_update` above the worlds W up to `steps_per_update` - 1 steps later: after step 19 for 16, in
-    one world with `steps_per_update=4`. A turn of W worlds is W steps."""
+    """The step from which on steps count for updates; a turn of W worlds is W steps. `updates_per_step`
+    updates follow every `steps_per_update` steps that count, this step included. So the first update comes at
+    this step, or, if `steps_per_update` is larger than W, up to `steps_per_update` - 1 steps later: after
+    step 19 for 16, in one world with `steps_per_update=4`."""
     gamma: Share = 0.995
     """Discount factor per step."""
     learning_rate: LearningRate = 1e-5
@@ -95,37 +94,38 @@ class DQNSettings(Exploring, Falling):
     updates_per_step: Positive = 1
     """Updates per step, or after `steps_per_update` of them, each with a new minibatch."""
     steps_per_update: Steps = 1
-    """Steps from one update to the next; the study updates after each, Mnih et al. (2015) after every fourth,
-    with minibatches of 32. With W worlds the default is thus W updates a turn; `steps_per_update=W` is one,
-    which samples as many transitions a step as the study with a `batch_size` W times as large."""
-    n_steps: Turns = 1
-    """Rewards that an n-step target sums before it bootstraps; fewer if the episode ends sooner. As TorchRL's
-    `MultiStepTransform`; the study used 1."""
-    sequence_steps: Turns = 1
+    """Steps from one update to the next. The study updates after every step, Mnih et al. (2015) after every
+    fourth, with minibatches of 32. In W worlds the default is W updates per turn; `steps_per_update=W` is one
+    update per turn, and samples as many transitions per step as the study if `batch_size` is W times as
+    large."""
+    n_steps: ReturnSteps = 1
+    """Rewards that a target sums before it bootstraps, or fewer if the episode ends sooner, as in TorchRL's
+    `MultiStepTransform`. The study used 1."""
+    sequence_steps: ReturnSteps = 1
     """Consecutive turns T of each sampled sequence, through which gradients of a recurrent network run: 2 or
     more for such a network, 1 for any other. A minibatch then has `batch_size` sequences. Hausknecht and
     Stone (2015) took 10 turns, Kapturowski et al. (2019) 80."""
     optimizer: Optimizer = "adam"
     """See `Optimizer`; [run] "adam", and "keras_rmsprop" in some versions of experiment 5."""
     tau: Annotated[float, Range(1e-6, 1)] | None = None
-    """Soft target updates: the fraction by which targets move towards the network after each update;
-    None for a copy every `target_every_updates` updates or `target_every_episodes` episodes."""
+    """The fraction by which targets move towards the network after each update (soft target updates); None
+    for a copy every `target_every_updates` updates or `target_every_episodes` episodes."""
     target_every_updates: Annotated[int, Range(1, MOST_INT64)] | None = None
-    """Updates between copies of the network to its target, a period that does not depend on how long
-    episodes last; None for a copy every `target_every_episodes` episodes. A turn of W worlds has W x
-    `updates_per_step` / `steps_per_update` updates. Mnih et al. (2015) took 10,000."""
+    """Updates between copies of the network to its target; unlike `target_every_episodes` it does not depend
+    on the length of episodes. None for a copy every `target_every_episodes` episodes. A turn of W worlds has
+    W x `updates_per_step` / `steps_per_update` updates. Mnih et al. (2015) took 10,000."""
     target_every_episodes: Steps = 3
     """Episodes, of all W worlds together, between copies of the network to its target, if `tau` and
     `target_every_updates` are None; experiment 5 used 3 or 10."""
     relu_on_outputs: bool = False
-    """[run] Whether the Q values pass through ReLU too; refused for SAC."""
+    """[run] True if the Q values pass through ReLU too; refused for SAC."""
     glorot_uniform: bool = False
-    """[run] Whether weights are initialised Glorot-uniform and biases to zero; else torch's default."""
+    """[run] True if weights are initialised Glorot-uniform and biases to zero; else torch's default."""
     own_target_weights: bool = False
-    """[run] Whether the target network has its own initial weights; else it starts as a copy."""
+    """[run] True if the target network has its own initial weights; else it starts as a copy."""
     mean_over_all_outputs: bool = False
-    """[run] Whether the loss is averaged over all A outputs, where all but the chosen action contribute zero;
-    else over the batch alone. Every loss is divided by A then, whatever its function."""
+    """[run] True if the loss is averaged over all A outputs, of which all but the chosen action contribute
+    zero: then every loss is divided by A, with any loss function. Else it is averaged over the batch."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -147,11 +147,16 @@ class DQNSettings(Exploring, Falling):
             )
 
     def updates_in(self, steps: int, *, worlds: int) -> int:
-        """Return how many updates an agent has in so many steps of all worlds W of a replica."""
+        """Return the number of updates that an agent takes in a number of steps of its replica.
+
+        Args:
+            steps: the steps of all worlds together.
+            worlds: the number of worlds W of the replica.
+        """
         return steps // self.steps_per_update * self.updates_per_step
 
     def refuse_worlds(self, worlds: int) -> None:
-        """Raises a ValueError where a replica of so many worlds W cannot learn by these."""
+        """Raise a ValueError if agents with these settings cannot learn in this number of worlds."""
         fewest = worlds * 2 * max(1, self.n_steps, self.sequence_steps) if worlds > 1 else 1
         if self.buffer_size < fewest:
             raise ValueError(
@@ -160,9 +165,9 @@ class DQNSettings(Exploring, Falling):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _OfRollouts(Value, stored=False):
-    """What agents have in common that learn from rollouts of their present policies. The study has none; the
-    defaults are ours."""
+class _RolloutSettingsBase(Value, stored=False):
+    """The settings of all agents that learn from rollouts of their current policies. The study has no such
+    agents; the defaults are cprl's."""
 
     rollout_steps: Positive = 250
     """Turns T of each world collected between updates, so T x W steps of W worlds; an update of LOLA takes
@@ -181,7 +186,7 @@ class _OfRollouts(Value, stored=False):
     """Lambda of generalised advantage estimation (Schulman et al. 2016). At 1 advantages are returns to the
     end of the episode, or of the rollout, less a value."""
     normalize_advantage: bool = True
-    """Whether each agent's advantages of a rollout are normalised to mean 0 and standard deviation 1."""
+    """True if each agent's advantages of a rollout are normalised to mean 0 and standard deviation 1."""
     hidden_cells: Layers = DEFAULT_HIDDEN_CELLS
     """Units of each hidden layer, with ReLU, of the actor and of the critic; used if the algorithm has no
     `network`."""
@@ -196,12 +201,12 @@ class _OfRollouts(Value, stored=False):
 
 
 @dataclass(frozen=True, kw_only=True)
-class RolloutSettings(_OfRollouts, Falling):
+class RolloutSettings(_RolloutSettingsBase, LearningRateDecay):
     """Hyperparameters of one independent on-policy agent."""
 
     only_in_play: bool = False
-    """Whether losses and the normalisation of advantages leave out the turns in which an agent was out of
-    play, in which its actions did nothing. If not, agents learn from them too, as in the study."""
+    """True if losses and the normalisation of advantages leave out the turns in which an agent was out of
+    play, so that its actions had no effect. Else agents learn from these turns too, as in the study."""
 
     epochs: Positive = 4
     """Passes over each rollout."""
@@ -210,7 +215,12 @@ class RolloutSettings(_OfRollouts, Falling):
     worlds, and `rollout_steps` or be a multiple of it."""
 
     def updates_in(self, steps: int, *, worlds: int) -> int:
-        """Return how many updates an agent has in so many steps of all worlds W of a replica."""
+        """Return the number of updates that an agent takes in a number of steps of its replica.
+
+        Args:
+            steps: the steps of all worlds together.
+            worlds: the number of worlds W of the replica.
+        """
         rollout_steps = self.rollout_steps * worlds
         return steps // rollout_steps * self.epochs * (rollout_steps // self.minibatch_size)
 
@@ -224,7 +234,7 @@ class RolloutSettings(_OfRollouts, Falling):
             )
 
     def refuse_worlds(self, worlds: int) -> None:
-        """Raises a ValueError where a replica of so many worlds W cannot learn by these."""
+        """Raise a ValueError if agents with these settings cannot learn in this number of worlds."""
         if (self.rollout_steps * worlds) % self.minibatch_size:
             raise ValueError(
                 f"RolloutSettings.minibatch_size is {self.minibatch_size}; it must divide rollout_steps x "
@@ -233,16 +243,18 @@ class RolloutSettings(_OfRollouts, Falling):
 
 
 @dataclass(frozen=True, kw_only=True)
-class TabularSettings(Exploring):
-    """Hyperparameters of one tabular agent. The study gives none; the defaults are ours."""
+class TabularSettings(EpsilonGreedy):
+    """Hyperparameters of one tabular agent. The study does not say them; the defaults are cprl's."""
 
     gamma: Share = 0.995
     """Discount factor per step, as `DQNSettings.gamma`."""
     learning_rate: Share | Literal["1/visits"] = 0.1
-    """alpha: a number, or one divided by the number of visits of that action in that state."""
+    """The step size alpha: a number, or "1/visits", one divided by the number of visits of the action in the
+    state."""
     visits_power: Share = 1.0
-    """With "1/visits", alpha is 1 / visits ** visits_power. Powers below 1 forget early targets sooner, which
-    came from values that were still wrong: 0.5..1 needs far fewer steps (Even-Dar and Mansour 2003)."""
+    """With "1/visits", alpha is 1 / visits ** visits_power. A power below 1 forgets early targets sooner,
+    which were computed from values that were still wrong: powers in 0.5..1 need far fewer steps (Even-Dar and
+    Mansour 2003)."""
     epsilon_decay_steps: Steps = 50_000
     """Steps of the linear decay after the hold."""
     max_states: Positive = 100_000
@@ -250,25 +262,26 @@ class TabularSettings(Exploring):
     bytes of its observation, 16 per action and about 150 more."""
 
     def rates(self, visits: Int64) -> Float64:
-        """alpha of values with these numbers of visits, the current one included."""
+        """Return the step size alpha of each value, by its number of visits, the current one included."""
         if self.learning_rate == "1/visits":
             return 1.0 / visits.astype(np.float64) ** self.visits_power
         return np.full(visits.shape, self.learning_rate)
 
 
 @dataclass(frozen=True, kw_only=True)
-class LOLASettings(_OfRollouts):
+class LOLASettings(_RolloutSettingsBase):
     """Hyperparameters of the members of a team that learns by LOLA."""
 
     look_ahead_rate: Annotated[float, Range(0, 1e12)] = 0.03
     """The size of the step, by plain gradient descent, that each member expects of the others; 0 is
     naive learning. The papers' 0.3 to 1 are for policies of five numbers; on boards of the commons 0.03 is a
-    step as long as a tenth of the weights, 1 a policy that has nothing to do with the present one."""
+    step as long as a tenth of the weights, 1 a policy that has nothing to do with the current one."""
     learning_rate: LearningRate = 1e-3
     max_grad_norm: NormLimit = None
     gae_lambda: Share = 1.0
     normalize_advantage: bool = False
-    """As of other agents; it scales the gradients, and so the steps that are expected of the others."""
+    """True if advantages are normalised as for other agents; it scales the gradients, and so the steps that
+    are expected of the others."""
     critic_learning_rate: LearningRate = 1e-3
     """The step size of Adam for the critics."""
     critic_epochs: Natural = 10

@@ -1,4 +1,4 @@
-"""Transitions of single agents: those of lanes, and under TorchRL's default keys, which its losses read."""
+"""Transitions of single agents: a turn as the lanes store it, and as TorchRL's losses read it."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ from cprl.keys import Turn
 
 
 class Horizon(NamedTuple):
-    """Returns of several steps: how many rewards they sum, and by which discount."""
+    """The number of rewards that n-step returns sum, and their discount."""
 
     steps: int
     gamma: float
@@ -22,136 +22,136 @@ class Horizon(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class TransitionForm:
-    """What a lane stores of a turn, and what is sampled of it."""
+    """The shapes and dtypes of what a lane stores of a turn, and of what is sampled."""
 
     observation_shape: tuple[int, ...]
-    """(C, X, Y); (S, C, X, Y) if a lane is a team of S agents."""
+    """The shape of a lane's observation: (C, X, Y), or (S, C, X, Y) for a team of S agents."""
     observation_dtype: str = "uint8"
+    """The dtype of observations, by its name in torch."""
     action_shape: tuple[int, ...] = ()
-    """Of a lane's action: () for one agent, (S,) for a team."""
+    """The shape of a lane's action: () for one agent; (S,) for a team; (N,) if it includes the actions of all
+    agents of the game."""
     reward_shape: tuple[int, ...] = ()
-    """Of a lane's reward: (S,) for a team whose members have their own, else ()."""
+    """The shape of a lane's reward: (S,) for a team whose members have their own rewards, else ()."""
     noise_shape: tuple[int, ...] = ()
-    """Of the uniform numbers that the loss reads with each transition: the entry "noise", float32
-    [L, b, *noise_shape]; () for none."""
+    """The shape of the uniform numbers that the loss reads with each transition, the entry "noise", float32
+    [L, b, *noise_shape]; () if the loss reads none."""
     horizon: Horizon | None = None
-    """Steps and discount of n-step returns, sampled in place of rewards; None for single steps."""
+    """The steps and the discount of the returns that are sampled in place of rewards; None for rewards."""
     state_cells: int = 0
-    """The numbers K of the state of a lane's recurrent network; 0 for one without."""
+    """The numbers K in the state of a lane's recurrent network; 0 for a network without a state."""
     sequence_steps: int = 1
-    """Turns of sampled sequences; 1 for transitions."""
+    """The turns of each sampled sequence; 1 if single transitions are sampled."""
     has_in_play: bool = False
-    """Whether it is stored who is in play."""
+    """True if the memory stores which agents are in play."""
 
     @property
     def dtype(self) -> torch.dtype:
-        dtype: torch.dtype = getattr(torch, self.observation_dtype)
-        return dtype
+        """Return the dtype of observations."""
+        return getattr(torch, self.observation_dtype)
 
     @property
     def steps_ahead(self) -> int:
-        """The turns after its first one that a sample reads."""
+        """Return how many turns a sample reads after its first turn."""
         return (self.horizon.steps if self.horizon else self.sequence_steps) - 1
 
 
 class LaneTurn(NamedTuple):
-    """One transition of each of L lanes in each of its W worlds, C = L x W columns in the order of the
-    worlds, see `by_lane`; numpy arrays on the CPU, else tensors. Where lanes are teams of S agents, their
-    fields have the axis of members next: [C, S, ...]."""
+    """One turn as transitions of L lanes in W worlds each, C = L x W columns.
+
+    Columns are in the order of the worlds, see `Lanes.by_lane`. Fields are numpy arrays on the CPU, else
+    tensors. If lanes are teams of S agents, fields of agents have a second axis for members, [C, S, ...].
+    """
 
     observation: Any
-    """[C, *shape] of observations."""
+    """[C, *observation_shape], before the turn."""
     action: Any
-    """int64 [C], or [C, N] for lanes that see the actions of their peers, see `joint_actions`."""
+    """int64 [C], or [C, N] for lanes that store the actions of all agents, see `joint_actions_by_agent`."""
     next_observation: Any
-    """[C, *shape]."""
+    """[C, *observation_shape], after the turn."""
     reward: Any
-    """float32 [C]; of teams [C, S] or, if their members share it, [C]."""
+    """float32 [C]; for teams [C, S], or [C] if the members share their reward."""
     done: Any
     """bool [C]."""
     terminated: Any
     """bool [C]."""
     recurrent_state: Any = None
-    """float32 [C, K], before the turn, of lanes with a recurrent network."""
+    """float32 [C, K], the states before the turn; None for lanes without a recurrent network."""
     next_recurrent_state: Any = None
-    """After it, likewise."""
+    """float32 [C, K], the states after the turn; None for lanes without a recurrent network."""
     in_play: Any = None
-    """bool [C], of teams [C, S]: whether it was in play, of lanes that learn from such turns alone."""
+    """bool [C], or [C, S] for teams: whether agents are in play; None for lanes that learn from all turns."""
 
 
 def lane_turn(agents: Sequence[int], turn: Turn, rewards: Any, *, are_team: bool = False) -> LaneTurn:
-    """One transition of each of S agents in every world, column = world x S + position in `agents`; views
-    where that is possible.
+    """Return one transition of each of S agents in every world, column = world x S + position in `agents`.
+
+    Fields are views of the turn's entries where that is possible.
 
     Args:
-        rewards: those that all agents want, [B, N].
-        are_team: whether the agents of a world are one column.
+        agents: the indices of the S agents.
+        rewards: the shaped rewards of all agents, [B, N].
+        are_team: true if the agents of a world are one column, a team.
     """
-    worlds, everyone = rewards.shape
-    at = list(agents)
-    everyone_learns = at == list(range(everyone))
-    columns = (worlds, len(at)) if are_team else (worlds * len(at),)
+    worlds, game_agents = rewards.shape
+    indices = list(agents)
+    all_learn = indices == list(range(game_agents))
+    columns = (worlds, len(indices)) if are_team else (worlds * len(indices),)
 
-    def of(array: Any) -> Any:
-        return (array if everyone_learns else array[:, at]).reshape(*columns, *array.shape[2:])
+    def by_agent(entry: Any) -> Any:
+        """Return an entry of all agents, [B, N, ...], as one of the columns, [C, ...]."""
+        selected = entry if all_learn else entry[:, indices]
+        return selected.reshape(*columns, *entry.shape[2:])
 
-    def of_world(flags: Any) -> Any:
+    def by_world(flags: Any) -> Any:
+        """Return flags of worlds, [B, 1], as flags of the columns, [C]."""
         if are_team:
             return flags.reshape(worlds)
-        return flags.repeat(len(at)) if isinstance(flags, np.ndarray) else flags.repeat_interleave(len(at))
+        count = len(indices)
+        return flags.repeat(count) if isinstance(flags, np.ndarray) else flags.repeat_interleave(count)
 
     return LaneTurn(
-        of(turn.agents["observation"]),
-        of(turn.agents["action"]),
-        of(turn.next_agents["observation"]),
-        of(rewards),
-        of_world(turn.next_world[keys.DONE]),
-        of_world(turn.next_world[keys.TERMINATED]),
+        by_agent(turn.agents["observation"]),
+        by_agent(turn.agents["action"]),
+        by_agent(turn.next_agents["observation"]),
+        by_agent(rewards),
+        by_world(turn.next_world[keys.DONE]),
+        by_world(turn.next_world[keys.TERMINATED]),
     )
 
 
-def joint_actions(agents: Sequence[int], turn: Turn) -> Any:
-    """The actions of all N agents in one turn, as each of S agents of every world sees them.
+def joint_actions_by_agent(agents: Sequence[int], turn: Turn) -> Any:
+    """Return the actions of all N agents in one turn, as each of S agents of every world stores them.
 
     Returns:
-        int64 [B x S, N]: first an agent's own action, then the others' in the order of their indices. They
-        are those that agents chose, also where an agent was out of play and its action did not count.
+        int64 [B x S, N]: first an agent's own action, then the others' in the order of their indices. An
+        agent that is out of play has the action that it chose, though it has no effect.
     """
     actions = turn.agents["action"]
-    everyone = actions.shape[1]
-    order = [[agent, *(other for other in range(everyone) if other != agent)] for agent in agents]
-    return actions[:, order].reshape(len(actions) * len(agents), everyone)
-
-
-def by_lane(columns: Tensor, *, replicas: int, worlds: int) -> Tensor:
-    """Values of all columns of a turn, [C, ...], as those of lanes and their worlds, [L, W, ...].
-
-    Columns are in the order of the B = R x W worlds, and within a world in that of its lanes: the agents that
-    learn apart, or one team.
-    """
-    if worlds == 1:
-        return columns[:, None]
-    by_world = columns.reshape(replicas, worlds, -1, *columns.shape[1:])
-    return by_world.swapaxes(1, 2).reshape(-1, worlds, *columns.shape[1:])
+    game_agents = actions.shape[1]
+    order = []
+    for agent in agents:
+        order.append([agent, *(peer for peer in range(game_agents) if peer != agent)])
+    return actions[:, order].reshape(len(actions) * len(agents), game_agents)
 
 
 def array_of(tensor: Tensor) -> Any:
-    """A numpy view of a tensor on the CPU; a tensor on a GPU unchanged. Both are indexed alike."""
+    """Return a tensor on the CPU as a numpy view, and a tensor on a GPU as it is; both are indexed alike."""
     return tensor.numpy() if tensor.is_cpu else tensor
 
 
 def transitions_of(fields: Mapping[str, Any]) -> TensorDict:
-    """The fields of a `LaneTurn`, of any batch size, as transitions under TorchRL's default keys."""
-    named = {name: torch.as_tensor(field) for name, field in fields.items() if field is not None}
-    size = named["done"].shape
-    following = {name: named[name].unsqueeze(-1) for name in ("reward", "done", "terminated")}
-    following["observation"] = named["next_observation"]
-    now = {name: named[name] for name in ("observation", "action")}
-    return TensorDict({**now, "next": TensorDict(following, size)}, size)
+    """Return the fields of a `LaneTurn`, of any batch size, as transitions under TorchRL's default keys."""
+    tensors = {name: torch.as_tensor(field) for name, field in fields.items() if field is not None}
+    size = tensors["done"].shape
+    next_entries = {name: tensors[name].unsqueeze(-1) for name in ("reward", "done", "terminated")}
+    next_entries["observation"] = tensors["next_observation"]
+    entries = {name: tensors[name] for name in ("observation", "action")}
+    return TensorDict({**entries, "next": TensorDict(next_entries, size)}, size)
 
 
 def refuse_other_dtype(dtype: Any, allowed: Any) -> None:
-    """Raises a ValueError for observations of another dtype than learners store; they would be rounded."""
+    """Raise a ValueError if observations have another dtype than learners store: they would be rounded."""
     if dtype != allowed:
         raise ValueError(
             f"observations are {dtype}; allowed: {allowed}, from Spaces.observation_dtype: make the learner "
@@ -159,11 +159,17 @@ def refuse_other_dtype(dtype: Any, allowed: Any) -> None:
         )
 
 
-def made_up(batch: TensorDict, actions: int) -> TensorDict:
-    """A batch in the form of another one, of other observations, actions and numbers; always the same."""
+def randomized(batch: TensorDict, actions: int) -> TensorDict:
+    """Return a synthetic batch: random observations, actions and other numbers in the shapes of a batch.
+
+    The numbers are the same in every call.
+
+    Args:
+        actions: the number of actions A.
+    """
     rng = torch.Generator().manual_seed(0)
 
-    def other(name: Any, entry: Tensor) -> Tensor:
+    def random(name: Any, entry: Tensor) -> Tensor:
         if entry.is_floating_point():
             return torch.rand(entry.shape, generator=rng).to(entry)
         if name == "action" or entry.dtype == torch.uint8:
@@ -171,5 +177,4 @@ def made_up(batch: TensorDict, actions: int) -> TensorDict:
             return torch.randint(highest, entry.shape, generator=rng).to(entry)
         return entry
 
-    made: TensorDict = batch.named_apply(other, nested_keys=True)
-    return made
+    return batch.named_apply(random, nested_keys=True)

@@ -3,8 +3,8 @@
 Modules, in the order in which one reads them:
     social        the formulas of the metrics
     registry      every total and every metric, each said once: words, unit, formula, bounds, colour
-    episodes      Episode, and EpisodeTracker, which makes them of batches of turns; metrics of the user's own
-    evaluate      one fresh episode in every world, without learning, turn by turn
+    tracker       Episode, and EpisodeTracker, which makes them of batches of turns; metrics of the user's own
+    playing       one fresh episode in every world, without learning, turn by turn
     table         tidy tables of episodes: their rows, labels and numbers
     windows       means over windows of episodes, in which every world counts alike
     statistics    estimates over replicas and differences, with intervals by Student's t, and Holm's families
@@ -13,6 +13,6 @@ Modules, in the order in which one reads them:
 """
 
 from cprl.measuring import social
-from cprl.measuring.episodes import Episode, EpisodeTracker
+from cprl.measuring.tracker import Episode, EpisodeTracker
 
 __all__ = ["Episode", "EpisodeTracker", "social"]

@@ -1,4 +1,4 @@
-"""How a training goes, and how it went: one set of words, windows and thresholds for all who say it.
+"""The label of a running training and the outcome of a finished one, with the same words and thresholds.
 
 Course       what a group of learners does at the moment, judged by its past alone: header and strip
 Outcome      how a training went, judged by the whole of it: sentences, tables of studies, reports
@@ -20,8 +20,9 @@ import pyarrow.compute as pc
 
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME
 from cprl.measuring.table import where, world_of
-from cprl.measuring.windows import LAST_EPISODES, mean_of_worlds, rounds_of
-from cprl.values.arrays import Float64
+from cprl.measuring.windows import episodes_per_world, mean_of_worlds
+from cprl.system.defaults import LAST_EPISODES
+from cprl.values.array_types import Float64
 
 BEGINS: Final = "begins"
 RISING: Final = "rising"
@@ -39,37 +40,36 @@ RECOVERY: Final = "recovery"
 TRAGEDY: Final = "tragedy"
 
 PEAK_EPISODES: Final = 10
-"""Episodes of the mean whose highest value is the peak of a training; before there are as many nothing is
-judged."""
+"""Episodes of the mean whose highest value is the peak of a training; with fewer, nothing is judged."""
 RECENT_SHARE: Final = 0.1
-"""The share of the episodes so far whose mean is judged while a training runs."""
-LEARNED: Final = 1.5
-"""How many times random play the peak of agents who learned something is at least."""
-LOST: Final = 1 / 3
-"""The part of the peak's lead over random play that is lost in a fall, at least."""
-LEAST_LOSS: Final = 0.15
-"""The share of the peak that is lost in a fall, however small its lead over random play."""
-REGAINED: Final = 1 / 4
-"""The part of the loss that is regained in a recovery, at least."""
-RISEN: Final = 0.1
-"""The share of its level by which a mean exceeds it to be rising."""
-BELOW_RANDOM: Final = 0.95
-"""How many times random play the end of a tragedy is, at most."""
-SHORT: Final = 0.1
-"""The share of random play by which a mean falls short of it to be below it while a training runs; of as few
-as ten episodes, it has to be more than at the end."""
-LIVED: Final = 0.7
-"""Of the steps that a board can last, what boards last in a tragedy at most."""
-STILL_DEAD: Final = 0.9
-"""The share of boards that die until which agents whose boards all died are called dead."""
-EXPLORES: Final = 0.5
-"""An epsilon above it is exploration even while it does not fall."""
+"""The share of the episodes so far in the mean that labels a running training."""
+LEARNED_FACTOR: Final = 1.5
+"""The least ratio of the peak to random play if agents have learned something."""
+LOST_SHARE: Final = 1 / 3
+"""The least share of the peak's lead over random play that a fall loses."""
+LEAST_LOSS_SHARE: Final = 0.15
+"""The least share of the peak that a fall loses, however small its lead over random play."""
+REGAINED_SHARE: Final = 1 / 4
+"""The least share of the loss that a recovery regains."""
+RISEN_SHARE: Final = 0.1
+"""The least relative increase of a mean that is rising."""
+BELOW_RANDOM_FACTOR: Final = 0.95
+"""The highest ratio of the last episodes to random play in a tragedy."""
+SHORT_SHARE: Final = 0.1
+"""The relative distance below random play from which a running training is labelled as below it; larger than
+at the end, since the mean is of few episodes."""
+LIVED_SHARE: Final = 0.7
+"""The longest mean life of boards in a tragedy, as a share of the longest life."""
+STILL_DEAD_SHARE: Final = 0.9
+"""The least share of dying boards at which the label stays "dead" once it is set."""
+EXPLORING_EPSILON: Final = 0.5
+"""The epsilon above which agents explore even if it does not fall."""
 
 
 class Course:
-    """The live label of a training, episode by episode.
+    """The live label of a running training, e.g. "rising", updated after each episode.
 
-    It is for people who watch. With m the mean over the last 10 % of the episodes of each replica so far (at
+    With m the mean over the last 10 % of the episodes of each replica so far (at
     least 10), as a mean over replicas, p its peak since the last fall, low its lowest in a fall, and r the
     mean of random play:
 
@@ -85,42 +85,41 @@ class Course:
     - steady: else.
 
     Args:
-        replicas: Those of the training. It is judged when all of them have ended W more episodes, each by as
-            many as the others.
-        worlds: The worlds W of each replica.
+        replicas: the replicas of the training; it is judged when all of them have ended W more episodes.
+        worlds: the worlds W of each replica.
     """
 
     def __init__(self, replicas: int = 1, worlds: int = 1) -> None:
         self.random_play: float | None = None
-        """r; None for the first mean instead."""
+        """The mean r of random play; None takes the first mean instead."""
         self.label = BEGINS
         self.mean = nan
-        """m after the last episode."""
+        """The mean m after the last episode."""
         self.peak = nan
-        """The highest m; NaN until there are enough episodes."""
+        """The highest mean m; NaN until there are enough episodes."""
         self.explores: bool | None = None
-        """Whether the epsilon of a learner falls, or is above 0.5; None while that is not known, and for
+        """True if the epsilon of a learner falls, or is above 0.5; None while that is not known, and for
         learners without one."""
         self._worlds = worlds
-        self._least = rounds_of(PEAK_EPISODES, worlds)
+        self._least_episodes = episodes_per_world(PEAK_EPISODES, worlds)
         self._waiting: list[deque[tuple[int, float, bool]]] = [deque() for _ in range(replicas)]
         """Episodes of each replica that the others have not ended."""
-        self._recent: dict[tuple[int, int], _Recent] = {}
-        """By replica and world."""
+        self._recent: dict[tuple[int, int], _RecentEpisodes] = {}
+        """The last episodes of each world, by replica and world."""
         self._rounds = 0
         """How often each replica has ended W episodes."""
         self._course = STEADY
-        self._low = self._top = self._first = self._level = nan
+        self._lowest = self._peak_since_fall = self._first_mean = self._rising_level = nan
         self._highest = 0
-        """The round with the highest m."""
+        """The round with the highest mean m."""
         self._epsilons: dict[str, float] = {}
 
     def add(self, value: float, *, replica: int = 0, world: int = 0, has_died: bool | None = None) -> str:
         """Add an episode that a world has ended, and return the label.
 
         Args:
-            value: What all agents got, e.g. the collective return; one that is not finite is left out.
-            has_died: Whether the board died before the clock; None for a game without stock.
+            value: what all agents got, e.g. the collective return; values that are not finite are left out.
+            has_died: whether the board died before the clock; None for a game without stock.
         """
         self._waiting[replica].append((world, value, bool(has_died)))
         if all(len(ended) >= self._worlds for ended in self._waiting):
@@ -131,10 +130,10 @@ class Course:
         """Judge whether agents explore.
 
         Args:
-            epsilons: Of each learner that has one now, by its name; NaN is left out.
+            epsilons: the current epsilon of each learner that has one, by its name; NaN is left out.
         """
         finite = {name: float(epsilon) for name, epsilon in epsilons.items() if isfinite(epsilon)}
-        if any(epsilon > EXPLORES for epsilon in finite.values()):
+        if any(epsilon > EXPLORING_EPSILON for epsilon in finite.values()):
             self.explores = True
         elif self._epsilons and finite:
             self.explores = any(
@@ -145,8 +144,8 @@ class Course:
 
     @property
     def _window(self) -> int:
-        """How many episodes of each world m is a mean of."""
-        return max(self._least, ceil(RECENT_SHARE * self._rounds))
+        """Return how many episodes of each world m is a mean of."""
+        return max(self._least_episodes, ceil(RECENT_SHARE * self._rounds))
 
     def _add_round(self) -> None:
         """Take W episodes of each replica, and judge."""
@@ -155,56 +154,61 @@ class Course:
             for _ in range(self._worlds):
                 world, value, has_died = ended.popleft()
                 if isfinite(value):
-                    of_world = self._recent.setdefault((replica, world), _Recent())
-                    of_world.add(value, has_died, most=self._window)
+                    last = self._recent.setdefault((replica, world), _RecentEpisodes())
+                    last.add(value, has_died, most=self._window)
         recent = self._recent.values()
         if recent:
-            self.mean = fmean(of_world.mean for of_world in recent)
+            self.mean = fmean(last.mean for last in recent)
         fewest = min(map(len, recent), default=0)
-        if len(recent) == len(self._waiting) * self._worlds and fewest >= self._least:
-            self._course = self._followed(self._course)
-            self.label = self._judged()
+        if len(recent) == len(self._waiting) * self._worlds and fewest >= self._least_episodes:
+            self._course = self._next_course(self._course)
+            self.label = self._judge()
 
-    def _judged(self) -> str:
+    def _judge(self) -> str:
         random = self.random_play
+        if random is None:
+            return self._course
         is_below = self.label in (BELOW, DEAD)
-        if random is None or self.mean >= random - (0 if is_below else SHORT * abs(random)):
+        lead = 0 if is_below else SHORT_SHARE * abs(random)
+        if self.mean >= random - lead:
             return self._course
         recent = self._recent.values()
-        died = sum(of_world.died for of_world in recent) / sum(map(len, recent))
-        return DEAD if died >= (STILL_DEAD if self.label == DEAD else 1) else BELOW
+        died = sum(last.died for last in recent) / sum(map(len, recent))
+        least = STILL_DEAD_SHARE if self.label == DEAD else 1
+        return DEAD if died >= least else BELOW
 
-    def _followed(self, course: str) -> str:
-        """Return the course after a round. `_top` is p, and `_low` the lowest mean of a fall."""
+    def _next_course(self, course: str) -> str:
+        """Return the course after a round. `_peak_since_fall` is p, and `_lowest` the lowest mean of a
+        fall."""
         mean = self.mean
         if isnan(self.peak):
-            self.peak = self._top = self._first = self._level = mean
+            self.peak = self._peak_since_fall = self._first_mean = self._rising_level = mean
         is_highest = mean >= self.peak
         if is_highest:
             self.peak = mean
             self._highest = self._rounds
         if course == FALLING:
-            self._low = min(self._low, mean)
-            self._level = self._low
-            if not is_regained(mean, peak=self._top, low=self._low):
+            self._lowest = min(self._lowest, mean)
+            self._rising_level = self._lowest
+            if not is_regained(mean, peak=self._peak_since_fall, low=self._lowest):
                 return course
-            self._top = mean
+            self._peak_since_fall = mean
             course = RECOVERING
-        self._top = max(self._top, mean)
-        random = self._first if self.random_play is None else self.random_play
-        if is_lost(mean, peak=self._top, random=random):
-            self._low = mean
+        self._peak_since_fall = max(self._peak_since_fall, mean)
+        random = self._first_mean if self.random_play is None else self.random_play
+        if is_lost(mean, peak=self._peak_since_fall, random=random):
+            self._lowest = mean
             return FALLING
         if course == RECOVERING:
             return RISING if is_highest else course
-        if mean - self._level > RISEN * abs(self._level):
-            self._level = mean
+        if mean - self._rising_level > RISEN_SHARE * abs(self._rising_level):
+            self._rising_level = mean
             return RISING
         is_recent = self._rounds < self._highest + self._window
         return RISING if course == RISING and is_recent else STEADY
 
 
-class _Recent:
+class _RecentEpisodes:
     """The last episodes of a world: the mean of what agents got, and how many boards died."""
 
     def __init__(self) -> None:
@@ -232,37 +236,37 @@ class _Recent:
 def is_lost(mean: float, *, peak: float, random: float) -> bool:
     """Return whether a mean has fallen from a peak."""
     loss = peak - mean
-    return loss > 0 and loss >= LOST * (peak - random) and loss >= LEAST_LOSS * abs(peak)
+    return loss > 0 and loss >= LOST_SHARE * (peak - random) and loss >= LEAST_LOSS_SHARE * abs(peak)
 
 
 def is_regained(mean: float, *, peak: float, low: float) -> bool:
     """Return whether a mean has recovered from the lowest one of a fall."""
-    return mean >= low + REGAINED * (peak - low)
+    return mean >= low + REGAINED_SHARE * (peak - low)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How a training of one replica went, or of several, of which each mean is the mean over replicas."""
+    """The outcome of the training of one replica, or of several, whose means are then means over replicas."""
 
     begins: float
-    """What all agents got in the first 10 episodes, their mean."""
+    """The mean of what all agents got in the first 10 episodes."""
     peak: float
     """The highest mean of 10 episodes."""
     around: int
-    """The episode about which these are, counted from 1."""
+    """The episode in the middle of those of the peak, counted from 1."""
     low: float
-    """The lowest mean of 30 episodes that begin with those of the peak, or later."""
+    """The lowest mean of 30 episodes from the peak on."""
     last: float
     """The mean of the last 30 episodes."""
     lived: float
-    """How long boards lasted in the last 30 episodes, as a share of the longest life in the training."""
+    """The mean life of boards in the last 30 episodes, as a share of the longest life in the training."""
     random: float
-    """What agents who act at random get, the mean."""
+    """The mean of what agents who act at random get."""
     agents: int
 
     @property
     def word(self) -> str:
-        """How it went.
+        """Return the word for the outcome.
 
         - no better: the peak is below 1.5 times random play;
         - recovery: a fall, of a third of the peak's lead over random play and 15 % of the peak, of which a
@@ -278,57 +282,60 @@ class Outcome:
         mere fall, why boards have to die. The numbers are ours. Whether the difference is more than chance is
         another question, which intervals over replicas answer.
         """
-        if self.peak < LEARNED * self.random:
+        if self.peak < LEARNED_FACTOR * self.random:
             return NO_BETTER
         has_fallen = is_lost(self.low, peak=self.peak, random=self.random)
         if has_fallen and is_regained(self.last, peak=self.peak, low=self.low):
             return RECOVERY
-        if self.last <= BELOW_RANDOM * self.random:
-            is_ruin = self.agents > 1 and self.lived <= LIVED
+        if self.last <= BELOW_RANDOM_FACTOR * self.random:
+            is_ruin = self.agents > 1 and self.lived <= LIVED_SHARE
             return TRAGEDY if is_ruin else DECLINE
         return DECLINE if is_lost(self.last, peak=self.peak, random=self.random) else HARVESTING
 
 
 RULE: Final = (
     f"its last {LAST_EPISODES} episodes against its peak and random play ({NO_BETTER}: no mean of "
-    f"{PEAK_EPISODES} episodes reached {LEARNED} times random play; {TRAGEDY}: several agents get at "
-    f"most {BELOW_RANDOM:.0%} of random play, and boards last at most {LIVED:.0%} of the longest life)"
+    f"{PEAK_EPISODES} episodes reached {LEARNED_FACTOR} times random play; {TRAGEDY}: several agents get at "
+    f"most {BELOW_RANDOM_FACTOR:.0%} of random play, and boards last at most {LIVED_SHARE:.0%} of the "
+    "longest life)"
 )
-"""How the word of an outcome is found, as tables say it."""
+"""The rule of the word, as tables explain it."""
 
 
 def outcome_of(table: pa.Table, *, random: float) -> Outcome:
-    """Return how a training went, of one replica or over several.
+    """Return the outcome of a training, of one replica or over several.
 
     Args:
-        table: Its episodes, those of each replica in the order in which they ended.
-        random: What agents who act at random get, the mean.
+        table: its episodes, those of each replica in the order in which they ended.
+        random: the mean of what agents who act at random get.
     """
     rows = where(table, agent=0)
-    got = COLLECTIVE_RETURN if COLLECTIVE_RETURN in table.column_names else INCOME
+    number = COLLECTIVE_RETURN if COLLECTIVE_RETURN in table.column_names else INCOME
     replicas = [where(rows, replica=replica) for replica in rows["replica"].unique().to_pylist()]
-    worlds = [world_of(of_one) for of_one in replicas]
+    worlds = list(map(world_of, replicas))
     lanes = len(np.unique(worlds[0]))
 
     def means(number: str, episodes: int) -> list[Float64]:
-        values = (of_one[number].to_numpy() for of_one in replicas)
-        return [mean_of_worlds(*of_one, episodes) for of_one in zip(values, worlds, strict=True)]
+        return [
+            mean_of_worlds(rows[number].to_numpy(), world, episodes)
+            for rows, world in zip(replicas, worlds, strict=True)
+        ]
 
-    tens = means(got, PEAK_EPISODES)
-    thirties = means(got, LAST_EPISODES)
+    tens = means(number, PEAK_EPISODES)
+    thirties = means(number, LAST_EPISODES)
     length = min(map(len, tens))
-    short = np.mean([of_one[:length] for of_one in tens], 0)
-    long = np.mean([of_one[:length] for of_one in thirties], 0)
-    size = rounds_of(PEAK_EPISODES, lanes) * lanes
-    later = rounds_of(LAST_EPISODES, lanes) * lanes - size
-    at = int(np.nanargmax(short))
-    lives = fmean(of_one[-1] for of_one in means("steps", LAST_EPISODES))
+    short = np.mean([curve[:length] for curve in tens], 0)
+    long = np.mean([curve[:length] for curve in thirties], 0)
+    size = episodes_per_world(PEAK_EPISODES, lanes) * lanes
+    later = episodes_per_world(LAST_EPISODES, lanes) * lanes - size
+    peak_index = int(np.nanargmax(short))
+    lives = fmean(curve[-1] for curve in means("steps", LAST_EPISODES))
     return Outcome(
         begins=float(short[~np.isnan(short)][0]),
-        peak=float(short[at]),
-        around=min(at + 1 - min(size, length) + size // 2, length),
-        low=float(np.nanmin(long[min(at + later, length - 1) :])),
-        last=fmean(of_one[-1] for of_one in thirties),
+        peak=float(short[peak_index]),
+        around=min(peak_index + 1 - min(size, length) + size // 2, length),
+        low=float(np.nanmin(long[min(peak_index + later, length - 1) :])),
+        last=fmean(curve[-1] for curve in thirties),
         lived=lives / pc.max(rows["steps"]).as_py(),
         random=random,
         agents=pc.max(table["agent"]).as_py() + 1,

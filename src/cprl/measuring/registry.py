@@ -1,4 +1,4 @@
-"""All that an episode is counted and measured by, each said once.
+"""The registry of all totals and metrics of an episode, each defined once.
 
 A total is what the turns of an episode add up to; a metric is a function of totals, and its parameters are
 the totals that it needs. The arrays of a tracker, the columns of tables, what is left out where a game lacks
@@ -19,15 +19,14 @@ from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons.cells import APPLE, Colour
-from cprl.institutions import COUNTS, Institution, Levies, ledger
+from cprl.institutions import COUNT_NAMES, Institution, Levies, ledger
 from cprl.measuring.social import (
-    Groups,
+    AgentGroups,
     equality,
     equality_between,
     equality_within,
@@ -36,26 +35,24 @@ from cprl.measuring.social import (
     share_of,
 )
 from cprl.pictures.colours import BLUE, GREEN, GREY, ORANGE, PALETTE, PURPLE, VERMILION
-from cprl.values import OWN_METRICS
-from cprl.values.arrays import Float64
-
-Array = NDArray[Any]
+from cprl.values import METRIC_WORDS
+from cprl.values.array_types import AnyArray, Float64
 
 COLLECTIVE_RETURN: Final = "collective_return"
 EQUALITY: Final = "equality"
 INCOME: Final = "income"
 INCOME_EQUALITY: Final = "income_equality"
-FINES: Final = keys.FINES[-1]
-TRANSFERS: Final = keys.TRANSFERS[-1]
-VIOLATIONS: Final = COUNTS[ledger.VIOLATIONS]
+FINES_TOTAL: Final = keys.FINES[-1]
+TRANSFERS_TOTAL: Final = keys.TRANSFERS[-1]
+VIOLATIONS: Final = COUNT_NAMES[ledger.VIOLATIONS]
 
 INSTITUTIONS: Final = "institutions/"
-"""How the names of metrics begin that are of institutions alone."""
-SHARE: Final = "0 to 1"
-"""In place of a unit."""
-RATIO: Final = "ratio"
+"""The prefix of the names of metrics of institutions."""
+SHARE_UNIT: Final = "0 to 1"
+"""The text in place of a unit for numbers from 0 to 1."""
+_RATIO: Final = "ratio"
 APPLES: Final = "apples"
-STEPS: Final = "steps"
+_STEPS: Final = "steps"
 
 
 _INT: Final = pa.int32()
@@ -63,58 +60,66 @@ _INT: Final = pa.int32()
 
 @dataclass(frozen=True, kw_only=True)
 class Total:
-    """What the turns of an episode add up to: [N] of each agent, [N, N] of pairs, or one number."""
+    """A number that the turns of an episode add up to: [N] for agents, [N, N] for pairs, or one number."""
 
     name: str
     entry: str | None = None
-    """The entry of a turn that it is counted from, the last part of its key in `cprl.keys`; None of what
-    every game reports."""
+    """The entry of a turn that it is counted from, as the last part of its key in `cprl.keys`; None if every
+    game reports it."""
     axes: str = "N"
-    """After that of worlds: N agents, C counts, V decisions; "" of the whole episode."""
+    """The axes after that of worlds: N agents, C counts, V decisions; "" for the whole episode."""
     dtype: type = np.int64
     column: pa.DataType | None = _INT
-    """Its type in tables; None where they do not have it."""
-    add: Callable[[Array, Array, Array], None] | None = None
-    """Adds the entry of a turn to the total of running episodes, given also their steps so far, [B]; None
-    for what follows from other totals, or from the last turn."""
+    """The type of its column in tables; None for no column."""
+    add: Callable[[AnyArray, AnyArray, AnyArray], None] | None = None
+    """The function that adds the entry of a turn to the total of running episodes, given their steps so far,
+    [B]; None if it follows from other totals, or from the last turn."""
     is_of_institutions: bool = False
-    """Whether only games with institutions report it; they lack nothing else without it."""
+    """True if only games with institutions report it."""
     words: str = ""
-    """What it is called where it stands for single agents."""
+    """Its name in plots of single agents."""
     unit: str = ""
+    """Its unit in plots of single agents."""
 
     @property
     def skips_zeros(self) -> bool:
-        """Whether entries of zeros add nothing to it."""
-        return self.add in (_sum, _bites, _times_of_bites, _any)
+        """Return whether entries of zeros add nothing to it."""
+        return self.add in (_add_entry, _count_harvests, _add_harvest_times, _count_any)
 
 
-def _sum(total: Array, entry: Array, steps: Array) -> None:
+def _add_entry(total: AnyArray, entry: AnyArray, steps: AnyArray) -> None:
+    """Add the entry."""
     total += entry
 
 
-def _bites(total: Array, entry: Array, steps: Array) -> None:
+def _count_harvests(total: AnyArray, entry: AnyArray, steps: AnyArray) -> None:
+    """Count the steps in which an agent harvests."""
     total += entry > 0
 
 
-def _times_of_bites(total: Array, entry: Array, steps: Array) -> None:
+def _add_harvest_times(total: AnyArray, entry: AnyArray, steps: AnyArray) -> None:
+    """Add the current step for each agent that harvests."""
     total += (entry > 0) * steps[:, None]
 
 
-def _any(total: Array, entry: Array, steps: Array) -> None:
+def _count_any(total: AnyArray, entry: AnyArray, steps: AnyArray) -> None:
+    """Count the steps in which the entry is true for any agent of its last axis."""
     total += entry.any(-1)
 
 
-def _last(total: Array, entry: Array, steps: Array) -> None:
+def _keep_last(total: AnyArray, entry: AnyArray, steps: AnyArray) -> None:
+    """Keep the entry of the last turn."""
     total[:] = entry
 
 
-def _first(total: Array, entry: Array, steps: Array) -> None:
+def _keep_first(total: AnyArray, entry: AnyArray, steps: AnyArray) -> None:
+    """Keep the entry of the first turn."""
     is_first = steps == 1
     total[is_first] = entry[is_first]
 
 
-def _step_of_first_zero(total: Array, entry: Array, steps: Array) -> None:
+def _note_first_zero_step(total: AnyArray, entry: AnyArray, steps: AnyArray) -> None:
+    """Keep the first step in which the entry is 0."""
     if np.count_nonzero(entry) < entry.size:
         is_now = (entry[:, 0] == 0) & (total == 0)
         total[is_now] = steps[is_now]
@@ -124,67 +129,71 @@ def _by_name(*entries: Any) -> dict[str, Any]:
     return {entry.name: entry for entry in entries}
 
 
-def _of_law(name: str, entry: str, words: str, **more: Any) -> Total:
-    return Total(name=name, entry=entry, words=words, add=_sum, is_of_institutions=True, **more)
+def _institution_total(name: str, entry: str, words: str, **more: Any) -> Total:
+    return Total(name=name, entry=entry, words=words, add=_add_entry, is_of_institutions=True, **more)
 
 
-_MONEY: Final = {"dtype": np.float64, "column": pa.float64(), "unit": APPLES}
-_REAL: Final[Any] = {"dtype": np.float64, "column": pa.float64()}
-_UNSEEN: Final[Any] = {"column": None}
+_APPLES_COLUMN: Final = {"dtype": np.float64, "column": pa.float64(), "unit": APPLES}
+_FLOAT_COLUMN: Final[Any] = {"dtype": np.float64, "column": pa.float64()}
+_NO_COLUMN: Final[Any] = {"column": None}
 
 TOTALS: Final[Mapping[str, Total]] = _by_name(
-    Total(name="return", **_REAL),
-    Total(name="wanted_return", **_REAL),
-    Total(name="harvest", entry="harvest", add=_sum, **_REAL),
-    Total(name="harvest_steps", entry="harvest", add=_bites, **_UNSEEN),
-    Total(name="harvest_time", entry="harvest", add=_times_of_bites, **_UNSEEN),
+    Total(name="return", **_FLOAT_COLUMN),
+    Total(name="wanted_return", **_FLOAT_COLUMN),
+    Total(name="harvest", entry="harvest", add=_add_entry, **_FLOAT_COLUMN),
+    Total(name="harvest_steps", entry="harvest", add=_count_harvests, **_NO_COLUMN),
+    Total(name="harvest_time", entry="harvest", add=_add_harvest_times, **_NO_COLUMN),
     Total(name="steps", axes=""),
-    Total(name="in_play_steps", entry="in_play", add=_sum),
-    Total(name="shots", entry="fired", add=_sum),
-    Total(name="hit_by", entry="hit_by", axes="NN", add=_sum, **_UNSEEN),
+    Total(name="in_play_steps", entry="in_play", add=_add_entry),
+    Total(name="shots", entry="fired", add=_add_entry),
+    Total(name="hit_by", entry="hit_by", axes="NN", add=_add_entry, **_NO_COLUMN),
     Total(name="hits", entry="hit_by"),
-    Total(name="tagged", entry="tagged_by", add=_any),
-    Total(name="tagged_by", entry="tagged_by", axes="NN", add=_sum, **_UNSEEN),
-    Total(name="tags", entry="tagged_by", **_UNSEEN),
+    Total(name="tagged", entry="tagged_by", add=_count_any),
+    Total(name="tagged_by", entry="tagged_by", axes="NN", add=_add_entry, **_NO_COLUMN),
+    Total(name="tags", entry="tagged_by", **_NO_COLUMN),
     Total(name="stock_left", entry="stock", axes=""),
-    Total(name="depletion_step", entry="stock", axes="", add=_step_of_first_zero),
+    Total(name="depletion_step", entry="stock", axes="", add=_note_first_zero_step),
     Total(name="terminated", axes="", column=pa.bool_()),
     Total(name="decision", is_of_institutions=True),
-    _of_law(FINES, FINES, "fined", **_MONEY),
-    _of_law(TRANSFERS, TRANSFERS, "given", **_MONEY),
-    _of_law(VIOLATIONS, "violated", VIOLATIONS, unit="turns"),
-    Total(name="counts", entry="counts", axes="NC", add=_last, is_of_institutions=True, **_UNSEEN),
-    *(Total(name=name, entry="counts", is_of_institutions=True) for name in COUNTS if name != VIOLATIONS),
+    _institution_total(FINES_TOTAL, FINES_TOTAL, "fined", **_APPLES_COLUMN),
+    _institution_total(TRANSFERS_TOTAL, TRANSFERS_TOTAL, "given", **_APPLES_COLUMN),
+    _institution_total(VIOLATIONS, "violated", VIOLATIONS, unit="turns"),
+    Total(name="counts", entry="counts", axes="NC", add=_keep_last, is_of_institutions=True, **_NO_COLUMN),
+    *(
+        Total(name=name, entry="counts", is_of_institutions=True)
+        for name in COUNT_NAMES
+        if name != VIOLATIONS
+    ),
     Total(
         name="in_force",
         entry="in_force",
         axes="V",
         dtype=np.float64,
-        add=_first,
+        add=_keep_first,
         is_of_institutions=True,
-        **_UNSEEN,
+        **_NO_COLUMN,
     ),
 )
-"""In the order of the columns of tables. "hits" and "tags" are the columns of `hit_by` and `tagged_by`
-summed, "counts" the totals that follow it, by `cprl.institutions.COUNTS`."""
+"""All totals, in the order of the columns of tables. "hits" and "tags" are the sums of the columns of
+`hit_by` and `tagged_by`; "counts" holds the totals after it, by `cprl.institutions.COUNT_NAMES`."""
 
-OPTIONAL: Final = tuple(
-    dict.fromkeys(one.entry for one in TOTALS.values() if one.entry and not one.is_of_institutions)
+OPTIONAL_ENTRIES: Final = tuple(
+    dict.fromkeys(total.entry for total in TOTALS.values() if total.entry and not total.is_of_institutions)
 )
 """The entries that a game may lack, by the last part of their keys; all but "stock" are in "agents"."""
-OF_INSTITUTIONS: Final = tuple(
-    dict.fromkeys(one.entry for one in TOTALS.values() if one.entry and one.is_of_institutions)
+INSTITUTION_ENTRIES: Final = tuple(
+    dict.fromkeys(total.entry for total in TOTALS.values() if total.entry and total.is_of_institutions)
 )
-"""Those that only games with institutions have; all but "in_force" are in "agents"."""
-PLACES: Final[Mapping[str, Any]] = {
-    **{name: ("next", keys.AGENTS, name) for name in (*OPTIONAL, *OF_INSTITUTIONS)},
+"""The entries of games with institutions only; all but "in_force" are in "agents"."""
+ENTRY_KEYS: Final[Mapping[str, Any]] = {
+    **{name: ("next", keys.AGENTS, name) for name in (*OPTIONAL_ENTRIES, *INSTITUTION_ENTRIES)},
     "in_play": keys.IN_PLAY,
     "stock": ("next", keys.STOCK),
     "in_force": ("next", keys.IN_FORCE),
 }
-"""The keys of these entries in a batch."""
-OF_AGENTS: Final = tuple(name for name, total in TOTALS.items() if total.words)
-"""The totals of institutions that are logged of each agent."""
+"""The keys of optional and institutional entries in a batch."""
+AGENT_TOTALS: Final = tuple(name for name, total in TOTALS.items() if total.words)
+"""The totals of institutions that are logged for each agent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,58 +201,61 @@ class Metric:
     """A number of a whole episode, computed from its totals."""
 
     name: str
-    """With the prefix `INSTITUTIONS` where it is of institutions alone."""
+    """Its name, with the prefix `INSTITUTIONS` for metrics of institutions."""
     words: str
+    """Its name for people, e.g. "equality (1 - Gini)"."""
     unit: str
-    of: Callable[..., Any]
-    """From totals of episodes, [..., N] or [...], to float64 [...]. Its parameters are the totals that it
-    needs, and constants of the game; "return_" is "return"."""
+    """Its unit, e.g. "steps"; `SHARE_UNIT` for numbers from 0 to 1."""
+    formula: Callable[..., Any]
+    """The function from totals of episodes, [..., N] or [...], to float64 [...]. Its parameters are the
+    totals that it needs, and constants of the game; "return_" is "return"."""
     colour: Colour = GREY
-    """That of its lines; those that share a plot differ."""
+    """The colour of its lines; those that share a plot differ."""
     plot: str | None = ""
     """The title of the viewer's plot that it shares with others; "" for one of its own, None for none."""
     is_summarised: bool = False
-    """Whether it is in the summary of a run."""
+    """True if it is in the summary of a run."""
     is_stored: bool = True
-    """Whether episodes have it, and tables a column; else it follows from their totals."""
+    """True if episodes have it, and tables a column; else it follows from their totals."""
     same_as: str | None = None
-    """The metric that it equals where nobody pays anything, or is out of play."""
+    """The metric that it equals in games without payments, or without agents out of play."""
     is_time: bool = False
-    """Whether it is at most the clock of an episode."""
+    """True if it is a number of steps, which the clock of an episode bounds."""
 
     @cached_property
     def needs(self) -> tuple[str, ...]:
-        """The totals and constants that it is computed from."""
-        return tuple(name.removesuffix("_") for name in signature(self.of).parameters)
+        """Return the totals and constants that it is computed from."""
+        return tuple(name.removesuffix("_") for name in signature(self.formula).parameters)
 
     @cached_property
     def entries(self) -> tuple[str, ...]:
-        """The entries of a turn that it needs."""
+        """Return the entries of a turn that it needs."""
         entries = (TOTALS[name].entry for name in self.needs if name in TOTALS)
         return tuple(dict.fromkeys(entry for entry in entries if entry))
 
     @property
     def is_of_institutions(self) -> bool:
-        return not set(OF_INSTITUTIONS).isdisjoint(self.entries) or "groups" in self.needs
+        return not set(INSTITUTION_ENTRIES).isdisjoint(self.entries) or "groups" in self.needs
 
     @property
     def title(self) -> str:
-        """Words and unit, e.g. "survival, steps"."""
+        """Return its words and unit, e.g. "survival, steps"."""
         return ", ".join(filter(None, (self.words, self.unit)))
 
 
-def _institutional(name: str, words: str, unit: str, of: Callable[..., Any], **look: Any) -> Metric:
-    plot = look.pop("plot", None)
-    return Metric(name=f"{INSTITUTIONS}{name}", words=words, unit=unit, of=of, plot=plot, **look)
+def _institutional(name: str, words: str, unit: str, formula: Callable[..., Any], **display: Any) -> Metric:
+    """Return a metric of institutions, which has no plot of its own."""
+    options = {"plot": None, **display}
+    return Metric(name=f"{INSTITUTIONS}{name}", words=words, unit=unit, formula=formula, **options)
 
 
 def _ratio(part: Any, whole: Any) -> Any:
-    """Return sum_i x_i / sum_i y_i; undefined where nothing is in the whole."""
+    """Return sum_i part_i / sum_i whole_i over agents i; NaN if the denominator is 0."""
     return share_of(part.sum(-1), whole.sum(-1))
 
 
-_SHARES: Final[Any] = {"plot": "Shares of turns, bites, violations, tags"}
-_INCOMES: Final[Any] = {"plot": "Equality of incomes"}
+_SHARES_PLOT: Final[Any] = {"plot": "Shares of turns, bites, violations, tags"}
+_INCOMES_PLOT: Final[Any] = {"plot": "Equality of incomes"}
 
 METRICS: Final[Mapping[str, Metric]] = _by_name(
     # sum_i R_i; what [W] calls "efficiency".
@@ -251,15 +263,15 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
         name=COLLECTIVE_RETURN,
         words="collective return",
         unit=APPLES,
-        of=lambda harvest: harvest.sum(-1),
+        formula=lambda harvest: harvest.sum(-1),
         colour=ORANGE,
     ),
-    # sum_i (R_i - fines_i + transfers_i): what all agents are paid. A game without a harvest has it too.
+    # sum_i (R_i - fines_i + transfers_i), the sum of all returns; also in games without a harvest.
     Metric(
         name=INCOME,
         words="income of all agents together",
         unit=APPLES,
-        of=lambda return_: return_.sum(-1),
+        formula=lambda return_: return_.sum(-1),
         plot=None,
         is_stored=False,
         same_as=COLLECTIVE_RETURN,
@@ -269,27 +281,27 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
         name="efficiency",
         words="efficiency",
         unit="apples per step",
-        of=lambda harvest, steps: share_of(harvest.sum(-1), steps),
+        formula=lambda harvest, steps: share_of(harvest.sum(-1), steps),
         colour=ORANGE,
     ),
     # 1 - sum_ij |R_i - R_j| / (2 N sum_i R_i) [P]; what [W] prints as "inequality".
     Metric(
         name=EQUALITY,
         words="equality (1 - Gini)",
-        unit=SHARE,
-        of=lambda harvest: equality(harvest),
+        unit=SHARE_UNIT,
+        formula=lambda harvest: equality(harvest),
         colour=BLUE,
         is_summarised=True,
     ),
-    # The same of incomes; wherever money moves.
+    # The equality of incomes, in games with fines or transfers.
     Metric(
         name=INCOME_EQUALITY,
         words="equality of incomes",
-        unit=SHARE,
-        of=lambda harvest, fines, transfers: equality(incomes_of(harvest, fines, transfers)),
+        unit=SHARE_UNIT,
+        formula=lambda harvest, fines, transfers: equality(incomes_of(harvest, fines, transfers)),
         colour=BLUE,
         same_as=EQUALITY,
-        **_INCOMES,
+        **_INCOMES_PLOT,
     ),
     # The mean, over the agents with a harvest, of E[t given r_i,t > 0], 1..T [P]: high where apples are
     # still there late. [P] does not define it for agents without a harvest; here they are left out, and
@@ -297,8 +309,8 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
     Metric(
         name="sustainability",
         words="sustainability",
-        unit=STEPS,
-        of=lambda harvest_time, harvest_steps: mean_of_defined(share_of(harvest_time, harvest_steps)),
+        unit=_STEPS,
+        formula=lambda harvest_time, harvest_steps: mean_of_defined(share_of(harvest_time, harvest_steps)),
         colour=GREEN,
         is_summarised=True,
         is_time=True,
@@ -307,8 +319,8 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
     Metric(
         name="survival_steps",
         words="survival",
-        unit=STEPS,
-        of=lambda steps: steps,
+        unit=_STEPS,
+        formula=lambda steps: steps,
         colour=(230, 120, 0),
         is_summarised=True,
         is_time=True,
@@ -318,7 +330,7 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
         name="peace",
         words="peace",
         unit="agents",
-        of=lambda in_play_steps, steps: share_of(in_play_steps.sum(-1), steps),
+        formula=lambda in_play_steps, steps: share_of(in_play_steps.sum(-1), steps),
         colour=PURPLE,
     ),
     # Agent-steps in play / N, 0..T, as in [W]; it also falls when episodes end early.
@@ -326,7 +338,7 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
         name="peacefulness",
         words="peacefulness",
         unit="steps in play per agent",
-        of=lambda in_play_steps: in_play_steps.sum(-1) / in_play_steps.shape[-1],
+        formula=lambda in_play_steps: in_play_steps.sum(-1) / in_play_steps.shape[-1],
         colour=PURPLE,
         is_summarised=True,
         same_as="survival_steps",
@@ -339,8 +351,8 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
     Metric(
         name="yield_share",
         words="yield share of the steps played",
-        unit=RATIO,
-        of=lambda harvest, steps, sustainable_yield, first_stock: share_of(
+        unit=_RATIO,
+        formula=lambda harvest, steps, sustainable_yield, first_stock: share_of(
             harvest.sum(-1), sustainable_yield * steps + first_stock
         ),
         colour=GREEN,
@@ -350,20 +362,20 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
         name="stock_left",
         words="stock left at the end",
         unit=APPLES,
-        of=lambda stock_left: stock_left,
+        formula=lambda stock_left: stock_left,
         colour=PALETTE[APPLE],
         is_summarised=True,
     ),
-    _institutional(FINES, "fines of all", APPLES, lambda fines: fines.sum(-1)),
-    _institutional(TRANSFERS, "transfers to all", APPLES, lambda transfers: transfers.sum(-1)),
+    _institutional(FINES_TOTAL, "fines of all", APPLES, lambda fines: fines.sum(-1)),
+    _institutional(TRANSFERS_TOTAL, "transfers to all", APPLES, lambda transfers: transfers.sum(-1)),
     _institutional(VIOLATIONS, VIOLATIONS, "turns", lambda violations: violations.sum(-1), colour=VERMILION),
     _institutional(
         "violations_per_step",
         "violations per turn in play",
-        SHARE,
+        SHARE_UNIT,
         lambda violations, in_play_steps: _ratio(violations, in_play_steps),
         colour=VERMILION,
-        **_SHARES,
+        **_SHARES_PLOT,
     ),
     _institutional("trespasses", "trespasses", "turns", lambda trespasses: trespasses.sum(-1)),
     _institutional("excess_bites", "taken above a quota", "bites", lambda excess_bites: excess_bites.sum(-1)),
@@ -372,113 +384,116 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
     _institutional(
         "own_share_of_bites",
         "bites where one may bite",
-        SHARE,
+        SHARE_UNIT,
         lambda own_bites, foreign_bites: _ratio(own_bites, own_bites + foreign_bites),
         colour=GREEN,
-        **_SHARES,
+        **_SHARES_PLOT,
     ),
     # Principle 4 [O], monitoring: near p of `Monitoring`.
     _institutional(
         "detection_rate",
         "violations detected",
-        SHARE,
+        SHARE_UNIT,
         lambda detections, violations: _ratio(detections, violations),
         colour=ORANGE,
-        **_SHARES,
+        **_SHARES_PLOT,
     ),
     # Principle 5 [O], graduated sanctions: violations by agents who were sanctioned before in the episode.
     _institutional(
         "recidivism",
         "violations after a sanction",
-        SHARE,
+        SHARE_UNIT,
         lambda returns_to_violation, violations: _ratio(returns_to_violation, violations),
         colour=PURPLE,
-        **_SHARES,
+        **_SHARES_PLOT,
     ),
     # Above 1 where tags are sanctioned too.
     _institutional(
         "sanctions_per_violation",
         "sanctions per violation",
-        RATIO,
+        _RATIO,
         lambda sanctions, violations: _ratio(sanctions, violations),
     ),
     # Principle 6 [O], conflict resolution; undefined without a tag.
     _institutional(
         "unjust_share_of_tags",
         "unjust tags",
-        SHARE,
+        SHARE_UNIT,
         lambda unjust_tags, tags: _ratio(unjust_tags, tags),
         colour=BLUE,
-        **_SHARES,
+        **_SHARES_PLOT,
     ),
     # Principle 8 [O], nested enterprises: of the harvest, and of incomes.
     _institutional(
         "equality_within",
         "equality within groups",
-        SHARE,
+        SHARE_UNIT,
         lambda harvest, groups: equality_within(harvest, groups),
     ),
     _institutional(
         "equality_between",
         "equality between groups",
-        SHARE,
+        SHARE_UNIT,
         lambda harvest, groups: equality_between(harvest, groups),
     ),
     _institutional(
         "income_equality_within",
         "equality of incomes within groups",
-        SHARE,
+        SHARE_UNIT,
         lambda harvest, fines, transfers, groups: equality_within(
             incomes_of(harvest, fines, transfers), groups
         ),
         colour=GREEN,
-        **_INCOMES,
+        **_INCOMES_PLOT,
     ),
     _institutional(
         "income_equality_between",
         "equality of incomes between groups",
-        SHARE,
+        SHARE_UNIT,
         lambda harvest, fines, transfers, groups: equality_between(
             incomes_of(harvest, fines, transfers), groups
         ),
         colour=ORANGE,
-        **_INCOMES,
+        **_INCOMES_PLOT,
     ),
 )
-"""In the order of pages and tables."""
-IN_FORCE: Final = f"{INSTITUTIONS}in_force_"
-"""How the numbers begin that say what each ballot decided for an episode."""
-SOCIAL: Final = tuple(name for name in METRICS if not METRICS[name].is_of_institutions)
-"""Those that say something of every game, as far as it reports their entries."""
+"""All metrics, in the order of pages and tables."""
+IN_FORCE_PREFIX: Final = f"{INSTITUTIONS}in_force_"
+"""The prefix of the numbers that say what each ballot decided for an episode."""
+SOCIAL_METRICS: Final = tuple(name for name in METRICS if not METRICS[name].is_of_institutions)
+"""The metrics of games without institutions."""
 
 
-def measured(totals: Mapping[str, Any], names: Iterable[str] = METRICS) -> dict[str, Float64]:
-    """Return the metrics all of whose totals and constants are given, by name, each float64 [...].
+def compute_metrics(totals: Mapping[str, Any], names: Iterable[str] = METRICS) -> dict[str, Float64]:
+    """Return the metrics whose totals and constants are all given, by name, each float64 [...].
 
     Args:
-        totals: by the names of `TOTALS`, arrays [..., N] or [...]; and the constants "sustainable_yield",
+        totals: arrays [..., N] or [...] by the names of `TOTALS`; also the constants "sustainable_yield",
             "first_stock" and "groups" of a game that has them.
-        names: of the metrics that are asked for.
+        names: the names of the metrics to compute.
     """
-    given = {name for name, value in totals.items() if value is not None}
-    return {
-        name: np.asarray(METRICS[name].of(*(totals[need] for need in METRICS[name].needs)), np.float64)
-        for name in names
-        if given.issuperset(METRICS[name].needs)
-    }
+    known = {name: value for name, value in totals.items() if value is not None}
+    metrics = {}
+    for name in names:
+        needs = METRICS[name].needs
+        if known.keys() >= {*needs}:
+            values = METRICS[name].formula(*map(known.get, needs))
+            metrics[name] = np.asarray(values, np.float64)
+    return metrics
 
 
-def measurable(reported: Collection[str], institutions: Sequence[Institution] = ()) -> tuple[str, ...]:
-    """Return the metrics that say something of the episodes of a game, in order; but for the income, which
-    tables have, and the yield share.
+def metrics_for(reported: Collection[str], institutions: Sequence[Institution] = ()) -> tuple[str, ...]:
+    """Return the metrics that make sense for a game, in order, without the yield share and the income, which
+    tables have.
 
     Args:
-        reported: the entries that the game reports, of `OPTIONAL` and `OF_INSTITUTIONS`.
-        institutions: its institutions. Of a game with none, whose entries are somebody's own, all but those
-            of groups.
+        reported: the entries that the game reports, of `OPTIONAL_ENTRIES` and `INSTITUTION_ENTRIES`.
+        institutions: its institutions; with none, its entries come from user code, and all metrics but those
+            of groups are returned.
     """
-    known = {*counts_for(institutions), *(name for name in TOTALS if name not in COUNTS), VIOLATIONS}
-    known |= {"groups"} if groups_of(institutions) is not None else set()
+    known = {*counts_for(institutions), *TOTALS.keys() - {*COUNT_NAMES}, VIOLATIONS}
+    if nested_groups(institutions) is not None:
+        known.add("groups")
     return tuple(
         name
         for name, metric in METRICS.items()
@@ -487,50 +502,54 @@ def measurable(reported: Collection[str], institutions: Sequence[Institution] = 
 
 
 def counts_for(institutions: Sequence[Institution]) -> tuple[str, ...]:
-    """Return the names of `cprl.institutions.COUNTS` that say something of a game with these institutions; of
-    a game with none, whose entries are somebody's own, all."""
-    counted = {VIOLATIONS, *(count for one in institutions for count in one.rule.counts)}
+    """Return the names of `cprl.institutions.COUNT_NAMES` that make sense for a game with these institutions;
+    all for a game without any, whose entries come from user code."""
+    counted = {VIOLATIONS, *(count for institution in institutions for count in institution.rule.counts)}
     if not institutions:
-        return COUNTS
-    needed = (set(metric.needs) & set(COUNTS) for metric in METRICS.values())
-    known = set[str]().union(*(names for names in needed if names <= counted))
-    return tuple(name for name in COUNTS if name in known)
+        return COUNT_NAMES
+    known = set[str]()
+    for metric in METRICS.values():
+        needed = set(metric.needs) & set(COUNT_NAMES)
+        if needed <= counted:
+            known |= needed
+    return tuple(name for name in COUNT_NAMES if name in known)
 
 
-def groups_of(institutions: Sequence[Institution]) -> Groups | None:
+def nested_groups(institutions: Sequence[Institution]) -> AgentGroups | None:
     """Return the groups of nested enterprises, those of the first `Levies`; None without one."""
-    return next((one.groups for one in institutions if isinstance(one, Levies)), None)
+    return next((institution.groups for institution in institutions if isinstance(institution, Levies)), None)
 
 
 def reported_by(env: EnvBase) -> tuple[str, ...]:
-    """Return the entries of `OPTIONAL` and `OF_INSTITUTIONS` in the specs of an environment, transforms
-    included."""
+    """Return the entries of `OPTIONAL_ENTRIES` and `INSTITUTION_ENTRIES` in the specs of an environment with
+    its transforms."""
     entries = set(env.observation_spec.keys(include_nested=True))
-    return tuple(name for name in PLACES if {name, (keys.AGENTS, name)} & entries)
+    return tuple(name for name in ENTRY_KEYS if {name, (keys.AGENTS, name)} & entries)
 
 
 def reported_in(tensordict: TensorDictBase) -> tuple[str, ...]:
-    """Return the entries of `OPTIONAL` and `OF_INSTITUTIONS` in a batch."""
-    return tuple(name for name, key in PLACES.items() if tensordict.get(key, None) is not None)
+    """Return the entries of `OPTIONAL_ENTRIES` and `INSTITUTION_ENTRIES` in a batch."""
+    return tuple(name for name, key in ENTRY_KEYS.items() if tensordict.get(key, None) is not None)
 
 
-def is_own(name: str) -> bool:
-    """Return whether a number of an episode is a metric of the user's own."""
+def is_custom_metric(name: str) -> bool:
+    """Return whether a number of an episode is a custom metric."""
     return not (name in METRICS or "/" in name or name.startswith("return_"))
 
 
 def _metric(name: str) -> Metric | None:
-    """Return a metric, of the user's own as far as its words are known; None of another number."""
-    if name in METRICS or not is_own(name):
+    """Return a metric by name, with the words of a custom one as far as they are known; None for another
+    number."""
+    if name in METRICS or not is_custom_metric(name):
         return METRICS.get(name)
-    words = OWN_METRICS.get(name, {})
+    words = METRIC_WORDS.get(name, {})
     return Metric(
-        name=name, words=words.get("title", name), unit=words.get("unit", ""), of=float, colour=ORANGE
+        name=name, words=words.get("title", name), unit=words.get("unit", ""), formula=float, colour=ORANGE
     )
 
 
 def title(name: str) -> str:
-    """Return words and unit of a metric, e.g. "survival, steps"; the name itself if it is none."""
+    """Return words and unit of a metric, e.g. "survival, steps"; for another number its name."""
     metric = _metric(name)
     return name if metric is None else metric.title
 
@@ -542,71 +561,73 @@ def colour(name: str) -> Colour:
 
 
 def unit(name: str) -> str:
-    """Return the unit after a value, e.g. "steps"; "" where a range stands for one. A single agent's return
-    is in apples."""
+    """Return the unit of a number, e.g. "steps"; "" if it has a range instead. A single agent's return is in
+    apples."""
     if name.startswith("return_") or name.endswith("/return"):
         return APPLES
     metric = _metric(name)
-    return "" if metric is None or metric.unit == SHARE else metric.unit
+    return "" if metric is None or metric.unit == SHARE_UNIT else metric.unit
 
 
 def with_unit(name: str, *, rewards: str = "") -> str:
-    """Return what a table calls a number, with its unit, e.g. "survival, steps" or "agent 0: return, apples".
+    """Return the heading of a number in a table, with its unit, e.g. "survival, steps" or "agent 0: return,
+    apples".
 
     Args:
-        name: of a metric, or of what agents get or pay: ".../return", ".../fines", ".../transfers".
-        rewards: the unit of rewards; "" if the game does not say.
+        name: the name of a metric, or of an amount of agents: ".../return", ".../fines", ".../transfers".
+        rewards: the unit of rewards; "" if it is unknown.
     """
     if name == INCOME:
         return ", ".join(filter(None, (METRICS[name].words, rewards)))
     if _metric(name) is not None:
         return title(name)
-    who, slash, what = name.rpartition("/")
-    if name.startswith(IN_FORCE):
-        return f"in force: decision {name.removeprefix(IN_FORCE)}"
-    unit_of = rewards if what in ("return", FINES, TRANSFERS) else ""
-    return ", ".join(filter(None, (f"{who.replace('_', ' ')}: {what}" if slash else name, unit_of)))
+    if name.startswith(IN_FORCE_PREFIX):
+        return f"in force: decision {name.removeprefix(IN_FORCE_PREFIX)}"
+    agents, slash, total = name.rpartition("/")
+    words = f"{agents.replace('_', ' ')}: {total}" if slash else name
+    unit_of = rewards if total in ("return", FINES_TOTAL, TRANSFERS_TOTAL) else ""
+    return ", ".join(filter(None, (words, unit_of)))
 
 
 def bounds(name: str, clock: float = inf) -> tuple[float, float]:
-    """Return what a number can be, as far as that is known; of a return, anything.
+    """Return the lowest and the highest possible value of a number; infinite if there is none.
 
     Args:
         clock: the steps of the longest episode that the game allows.
     """
     metric = _metric(name)
-    if metric is not None and metric.unit == SHARE:
+    if metric is not None and metric.unit == SHARE_UNIT:
         return 0.0, 1.0
     if metric is None or name == INCOME or name not in METRICS:
-        is_amount = name.rpartition("/")[2] in OF_AGENTS
+        is_amount = name.rpartition("/")[2] in AGENT_TOTALS
         return 0.0 if is_amount else -inf, inf
     return 0.0, clock if metric.is_time else inf
 
 
-def left_out(reported: Collection[str], *, more: Mapping[str, tuple[str, ...]] | None = None) -> str:
-    """Return one line with the numbers that are left out, and why; "" if there are none.
+def left_out_note(reported: Collection[str], *, more: Mapping[str, tuple[str, ...]] | None = None) -> str:
+    """Return one line about the numbers that are left out, and why; "" for none.
 
     Args:
-        reported: the entries of `OPTIONAL` that the game reports.
-        more: further names and the entries that they need; other words say what else the game lacks.
+        reported: the entries of `OPTIONAL_ENTRIES` that the game reports.
+        more: further numbers and the entries that they need, or words for what else the game lacks.
     """
-    needs = {name: METRICS[name].entries for name in SOCIAL if name not in (INCOME, *TOTALS)}
+    needs = {name: METRICS[name].entries for name in SOCIAL_METRICS if name not in (INCOME, *TOTALS)}
     lacking: dict[str, list[str]] = {}
-    for name, entries in {**needs, **NEEDS, **(more or {})}.items():
+    for name, entries in {**needs, **ENTRIES_OF_FIELDS, **(more or {})}.items():
         missing = " and no ".join(entry for entry in entries if entry not in reported)
         if missing and name != "yield_share":
             lacking.setdefault(missing, []).append(name)
-    parts = (f"{', '.join(names)} (the game reports no {missing})" for missing, names in lacking.items())
-    text = "; ".join(parts)
+    notes = (f"{', '.join(names)} (the game reports no {missing})" for missing, names in lacking.items())
+    text = "; ".join(notes)
     return f"left out: {text}" if text else ""
 
 
 def _entries_of(totals: Iterable[Total]) -> dict[str, tuple[str, ...]]:
-    return {one.name: (one.entry,) for one in totals if one.entry and one.column is not None}
+    return {total.name: (total.entry,) for total in totals if total.entry and total.column is not None}
 
 
-NEEDS: Final[Mapping[str, tuple[str, ...]]] = {
-    **_entries_of(one for one in TOTALS.values() if not one.is_of_institutions),
+ENTRIES_OF_FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
+    **_entries_of(total for total in TOTALS.values() if not total.is_of_institutions),
     "tagged_by": ("tagged_by",),
 }
-"""The entries that each field of an `Episode` needs; other fields need none."""
+"""The entries that each field of an `Episode` needs; missing fields need none."""

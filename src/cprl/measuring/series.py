@@ -1,4 +1,4 @@
-"""Observer: what happens in a training, handed to all who show or write it; recent means of its numbers."""
+"""Observer: hands what happens in a training to its callbacks; means of recent numbers."""
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -12,29 +12,30 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl.envs.unwrap import agent_names
-from cprl.measuring.episodes import Episode
-from cprl.measuring.registry import INSTITUTIONS, OF_AGENTS
+from cprl.measuring.registry import AGENT_TOTALS, INSTITUTIONS
+from cprl.measuring.tracker import Episode
 from cprl.system.times import Speed
-from cprl.values.arrays import Float64
+from cprl.values.array_types import Float64
 
-OF_GROUP: Final = ("social/", INSTITUTIONS)
-"""How the names of numbers begin that are of all agents together."""
-STEPS: Final = "time/env_steps"
+GROUP_PREFIXES: Final = ("social/", INSTITUTIONS)
+"""The prefixes of the names of numbers about all agents together."""
+ENV_STEPS: Final = "time/env_steps"
 SPEED: Final = "time/env_steps_per_s"
-"""The environment steps of each replica so far, and those of all per second, compiling left out."""
+"""The environment steps of each replica so far, and the steps of all replicas per second, without
+compilation."""
 
 
 class Observer:
-    """Watches a training, and hands its callbacks turns, episodes, and numbers by name.
+    """The caller of a training's callbacks: it hands them turns, episodes, and numbers by name.
 
-    It is what calls callbacks. Numbers of an episode, by the names of docs/metrics.md, are handed out once
-    all replicas have ended it, and their speed with them: loggers and the viewer write or draw what they get.
-    A `Training` has one; a loop of your own makes one, and calls `on_step` and `on_episode`.
+    Numbers of an episode, by the names of docs/metrics.md, are handed out once all replicas have ended it,
+    with the speed of the training. A `Training` has an observer; a custom loop makes one and calls `on_step`
+    and `on_episode`.
 
     Args:
-        callbacks: Each has some of the methods of `cprl.training.Callback`.
-        env: The worlds of all replicas R, and the names of the agents.
-        worlds: The worlds W of each replica. Numbers are then means over every W episodes.
+        callbacks: each has some of the methods of `cprl.training.Callback`.
+        env: the worlds of all replicas R, and the names of the agents.
+        worlds: the worlds W of each replica; numbers are means over every W episodes.
     """
 
     def __init__(self, callbacks: Sequence[Any], env: EnvBase, *, worlds: int = 1) -> None:
@@ -50,7 +51,7 @@ class Observer:
         return [getattr(callback, name) for callback in self.callbacks if hasattr(callback, name)]
 
     def on_start(self, training: Any) -> None:
-        """Go on where a training is."""
+        """Continue at the step of a training, and call `on_start`."""
         self.steps = training.steps
         self._speed = Speed(self.steps * self._series.replicas)
         for on_start in self._hooks("on_start"):
@@ -75,7 +76,7 @@ class Observer:
         if numbers is None:
             return
         if self.steps:
-            numbers[STEPS] = np.array([float(self.steps)])
+            numbers[ENV_STEPS] = np.array([float(self.steps)])
             numbers[SPEED] = np.array([self._speed.lap(self.steps * self._series.replicas)])
         for on_numbers in self._hooks("on_numbers"):
             on_numbers(episode.episode, numbers)
@@ -97,34 +98,34 @@ def numbers_of(episode: Episode, learning: Mapping[str, float], agents: Sequence
     """Return the numbers of an episode, by the names of docs/metrics.md; NaN where undefined.
 
     Args:
-        learning: the numbers of learning in it, by agent index: `agent_0/loss` and so on.
+        learning: the numbers of learning in the episode by agent index: `agent_0/loss` and so on.
         agents: the agents' names, which replace `agent_0` and so on.
     """
     numbers = {logged(name): value for name, value in episode.metrics.items()}
     for agent, value in zip(agents, episode.return_, strict=True):
         numbers[f"{agent}/return"] = float(value)
-    for name in OF_AGENTS:
+    for name in AGENT_TOTALS:
         if (values := getattr(episode, name)) is not None:
             numbers |= {f"{agent}/{name}": float(value) for agent, value in zip(agents, values, strict=True)}
-    named = {f"agent_{index}": agent for index, agent in enumerate(agents)}
+    names = {f"agent_{index}": agent for index, agent in enumerate(agents)}
     for name, value in learning.items():
-        of, slash, what = name.partition("/")
-        numbers[f"{named.get(of, of)}{slash}{what}"] = float(value)
+        learner, slash, what = name.partition("/")
+        numbers[f"{names.get(learner, learner)}{slash}{what}"] = float(value)
     return numbers
 
 
 class Series:
-    """Collects the numbers of an episode until all replicas have ended it, so that they are comparable.
+    """The numbers of episodes that not all replicas have ended yet, so that they can be compared.
 
-    Of replicas in W worlds, which end as many episodes in the time of one, they are means over every W
-    episodes, each replica's one after the other, of those in which they are defined.
+    With W worlds in each replica, numbers are means over every W episodes of a replica in which they are
+    defined.
     """
 
     def __init__(self, replicas: int, worlds: int = 1) -> None:
         self.replicas = replicas
         self.worlds = worlds
-        self._waiting: dict[int, dict[int, list[dict[str, float]]]] = {}
-        """By the number of W episodes, and by replica."""
+        self._waiting_numbers: dict[int, dict[int, list[dict[str, float]]]] = {}
+        """The numbers of episodes by group of W episodes, and by replica."""
 
     def add(self, episode: Episode, numbers: Mapping[str, float]) -> dict[str, Float64] | None:
         """Add the numbers of an episode of a replica.
@@ -142,15 +143,17 @@ class Series:
                 "those of the environment"
             )
         together = episode.episode // self.worlds
-        of_replicas = self._waiting.setdefault(together, {})
-        of_replicas.setdefault(episode.replica, []).append(dict(numbers))
-        if len(of_replicas) < self.replicas or min(map(len, of_replicas.values())) < self.worlds:
+        waiting = self._waiting_numbers.setdefault(together, {})
+        waiting.setdefault(episode.replica, []).append(dict(numbers))
+        if len(waiting) < self.replicas or min(map(len, waiting.values())) < self.worlds:
             return None
-        del self._waiting[together]
-        names = {name: None for each in of_replicas.values() for one in each for name in one}
-        return {
-            name: np.array([self._mean(of_replicas[r], name) for r in range(self.replicas)]) for name in names
-        }
+        del self._waiting_numbers[together]
+        names = {name: None for episodes in waiting.values() for numbers in episodes for name in numbers}
+        series = {}
+        for name in names:
+            means = [self._mean(waiting[replica], name) for replica in range(self.replicas)]
+            series[name] = np.array(means)
+        return series
 
     def _mean(self, episodes: Sequence[Mapping[str, float]], name: str) -> float:
         if self.worlds == 1:
@@ -158,12 +161,12 @@ class Series:
         return mean_of(np.array([numbers.get(name, np.nan) for numbers in episodes]))
 
     def state_dict(self) -> dict[str, Any]:
-        """Return the incomplete episodes."""
-        return {"waiting": deepcopy(self._waiting)}
+        """Return the numbers of episodes that not all replicas have ended."""
+        return {"waiting": deepcopy(self._waiting_numbers)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Continue with the incomplete episodes of a state."""
-        self._waiting = deepcopy(state["waiting"])
+        """Continue with the numbers of a state."""
+        self._waiting_numbers = deepcopy(state["waiting"])
 
 
 def mean_of(values: Float64) -> float:
@@ -173,16 +176,16 @@ def mean_of(values: Float64) -> float:
 
 
 class Recent:
-    """The mean of the last values.
+    """A mean over the last episodes.
 
     Args:
-        episodes: how many episodes it is of; with fewer, of all.
-        each: the number of episodes that each value is the mean of.
+        episodes: the episodes of the mean; with fewer, of all.
+        each: the number of episodes that each value is already a mean of.
     """
 
     def __init__(self, episodes: int, *, each: int = 1) -> None:
         self.window = ceil(episodes / each)
-        """How many values it is of, at most."""
+        """The most values of the mean."""
         self._last: deque[float] = deque(maxlen=self.window)
 
     def add(self, value: float) -> float:

@@ -14,17 +14,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cprl.values.arrays import Float64
+from cprl.values.array_types import Float64
 
-Groups = Sequence[Sequence[int]]
+AgentGroups = Sequence[Sequence[int]]
 """The indices of the agents of each group of nested enterprises; each agent belongs to one group."""
 
 _ROUNDING = 1e-6
-"""The share of all an agent got and gave below which its income is 0: payments are float32."""
+"""The share of harvest and payments below which an income is 0, since payments are float32."""
 
 
 def share_of(part: Any, whole: Any) -> Float64:
-    """Return part / whole, undefined where nothing is in the whole."""
+    """Return part / whole, undefined if the whole is 0."""
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.where(np.greater(whole, 0), np.divide(part, whole), np.nan)
 
@@ -32,8 +32,8 @@ def share_of(part: Any, whole: Any) -> Float64:
 def equality(incomes: Any) -> Float64:
     """Return 1 - Gini of the incomes of N agents, [..., N]: 1 - sum_ij |x_i - x_j| / (2 N sum_i x_i).
 
-    It is from 1/N, where one agent has everything, to 1, where all have the same. It is undefined where
-    nobody has anything, and where somebody has less than nothing, since Gini then has no bounds.
+    It ranges from 1/N, if one agent has everything, to 1, if all have the same. It is undefined if nobody has
+    anything, or somebody has less than nothing, since Gini then has no bounds.
     """
     incomes = np.asarray(incomes, np.float64)
     held = incomes.clip(min=0.0)
@@ -46,7 +46,7 @@ def incomes_of(harvest: Any, fines: Any, transfers: Any) -> Float64:
     """Return harvest - fines + transfers of each agent, float64 [..., N]; below 0 where fines exceed all
     else.
 
-    Payments are float32: what they leave by rounding alone, a millionth of all three, is 0.
+    Payments are float32, so an income within their rounding, a millionth of all three, is 0.
     """
     harvest, fines, transfers = (np.asarray(part, np.float64) for part in (harvest, fines, transfers))
     incomes = harvest - fines + transfers
@@ -54,8 +54,8 @@ def incomes_of(harvest: Any, fines: Any, transfers: Any) -> Float64:
     return np.where(is_rounding, 0.0, incomes)
 
 
-def equality_within(incomes: Any, groups: Groups) -> Float64:
-    """Return the mean `equality` within those of G groups where it is defined, [...].
+def equality_within(incomes: Any, groups: AgentGroups) -> Float64:
+    """Return the mean `equality` within groups, over the groups in which it is defined, [...].
 
     Principle 8 of Ostrom, "Governing the Commons" (1990): nested enterprises.
     """
@@ -63,7 +63,7 @@ def equality_within(incomes: Any, groups: Groups) -> Float64:
     return mean_of_defined(np.stack([equality(incomes[..., list(group)]) for group in groups], -1))
 
 
-def equality_between(incomes: Any, groups: Groups) -> Float64:
+def equality_between(incomes: Any, groups: AgentGroups) -> Float64:
     """Return the `equality` of the groups' mean incomes, each group counted once, [...]; principle 8."""
     incomes = np.asarray(incomes, np.float64)
     return equality(np.stack([incomes[..., list(group)].mean(-1) for group in groups], -1))
@@ -85,19 +85,19 @@ def summary(harvest: Tensor, in_play: Tensor) -> dict[str, Tensor]:
     Raises:
         ValueError: if a harvest is below 0, NaN or infinite.
     """
-    from cprl.measuring.registry import measured  # which is made of these formulas
+    from cprl.measuring.registry import compute_metrics  # imported here, because it imports these formulas
 
     if not ((harvest >= 0) & (harvest < torch.inf)).all():
         raise ValueError("harvest holds a number below 0, NaN or infinity; allowed: apples bitten")
     apples = harvest.numpy(force=True).astype(np.float64)
-    bites = apples > 0
-    times = np.arange(1, bites.shape[-2] + 1)
-    metrics = measured(
+    has_harvested = apples > 0
+    times = np.arange(1, apples.shape[-2] + 1)
+    metrics = compute_metrics(
         {
-            "steps": np.full(bites.shape[:-2], float(len(times))),
+            "steps": np.full(apples.shape[:-2], float(len(times))),
             "harvest": apples.sum(-2),
-            "harvest_steps": bites.sum(-2),
-            "harvest_time": (bites * times[:, None]).sum(-2),
+            "harvest_steps": has_harvested.sum(-2),
+            "harvest_time": (has_harvested * times[:, None]).sum(-2),
             "in_play_steps": in_play.numpy(force=True).sum(-2),
         }
     )

@@ -1,17 +1,20 @@
-"""The one currency after an episode: a tidy table, a row for each label, replica, world, episode and agent.
+"""Tables of episode results: what every run and every evaluation returns, and what all statistics read.
 
-Its columns are labels, which say what was played; "replica", "world" where it is of a training, "episode" and
-"agent"; "role", of an agent among others; totals and metrics, by the names of `cprl.measuring.registry`. So
-are the table of a run, `episodes.parquet`, and what every evaluation returns. A table of windows, as studies
-keep it, has instead of agents "metric", "window_episodes", "undefined" and "value".
+A table has one row for each replica, world, episode and agent. Its columns are, in this order: labels,
+which say what was played, such as "policy"; "replica"; "world" in tables of trainings; "episode"; "agent";
+"role" if agents of several runs play together; then totals and metrics, by their names in
+`cprl.measuring.registry`. The table of a run, `episodes.parquet`, is such a table.
 
-A number of episodes has a name: a metric ("equality", "institutions/violations", one of the user's own), or
-WHO/WHAT of some agents, the mean of theirs: "agent_2/fines", "focal/return", "background/return".
+A table of windows, as studies store it, has no rows of agents. It has the columns "metric", "value",
+"window_episodes" and "undefined", one row for each metric and window of episodes.
+
+Functions that take a `metric` accept the name of a metric of whole episodes ("equality",
+"institutions/violations", one of the user's own), or WHO/WHAT for the mean of a column over some agents:
+"agent_2/fines", "focal/return", "background/return".
 """
 
 from collections.abc import Mapping, Sequence
 from itertools import chain
-from math import inf
 from typing import Any, Final
 
 import numpy as np
@@ -20,63 +23,70 @@ import pyarrow.compute as pc
 
 from cprl.measuring.registry import (
     COLLECTIVE_RETURN,
-    FINES,
-    IN_FORCE,
+    FINES_TOTAL,
+    IN_FORCE_PREFIX,
     INCOME,
     INSTITUTIONS,
     METRICS,
     TOTALS,
-    is_own,
-    measured,
+    compute_metrics,
+    is_custom_metric,
 )
-from cprl.values.arrays import Int64
+from cprl.values.array_types import Int64
 
 ROLE: Final = "role"
-"""The column that says what an agent is among others: `FOCAL`, `BACKGROUND`, or `BOTH` in self-play."""
+"""The column with the role of an agent among others: `FOCAL`, `BACKGROUND`, or `BOTH` in self-play."""
 FOCAL: Final = "focal"
 BACKGROUND: Final = "background"
 BOTH: Final = "both"
 WINDOWS: Final = "window_episodes"
-"""The column that tables of windows have."""
-_INDICES: Final = ("replica", "world", "episode", "agent")
+"""The column with the number of episodes of a window; only tables of windows have it."""
+_EPISODE_KEYS: Final = ("replica", "world", "episode")
+"""The columns that tell an episode from others with the same labels."""
 _AGENT: Final = "agent_"
-_NAMES: Final = b"agents"
-"""Of a table's metadata: what the game calls the agents."""
+"""The beginning of an agent's name in the name of a metric."""
+_AGENT_NAMES: Final = b"agents"
+"""The key of a table's metadata with the names that the game gives its agents."""
 
 
 def complete(table: pa.Table, constants: Mapping[str, Any] | None = None) -> pa.Table:
-    """Return a table with every metric of the registry that its totals give, where it lacks one.
+    """Return the table with all metrics of the registry that its totals determine.
 
     Args:
-        constants: of the game, see `cprl.measuring.registry.measured`.
+        constants: totals that are the same in every episode of the game, see
+            `cprl.measuring.registry.compute_metrics`.
 
     Raises:
-        ValueError: if it lacks one and its rows are not whole episodes, each of all agents in order.
+        ValueError: if a metric has to be computed and the rows are not whole episodes, each with all agents
+            in order.
     """
     columns = {*table.column_names}
-    given = columns | {*(constants or {})}
-    lacking = [name for name, metric in METRICS.items() if name not in columns and given >= {*metric.needs}]
-    if not lacking or not len(table) or WINDOWS in columns:
+    available = columns | {*(constants or {})}
+    missing = [name for name in METRICS if name not in columns]
+    computable = [name for name in missing if available >= {*METRICS[name].needs}]
+    if not computable or not len(table) or WINDOWS in columns:
         return table
-    agents = _agents_of(table)
+    agents = _count_agents(table)
     totals = dict(constants or {})
-    needs = chain.from_iterable(METRICS[name].needs for name in lacking)
-    for name in columns & {*TOTALS} & {*needs}:
+    needed = chain.from_iterable(METRICS[name].needs for name in computable)
+    for name in columns & {*TOTALS} & {*needed}:
         values = table[name].to_numpy(zero_copy_only=False).astype(np.float64).reshape(-1, agents)
-        totals[name] = values if TOTALS[name].axes else values[:, 0]
-    for name, values in measured(totals, lacking).items():
+        is_of_each_agent = bool(TOTALS[name].axes)
+        totals[name] = values if is_of_each_agent else values[:, 0]
+    for name, values in compute_metrics(totals, computable).items():
         table = table.append_column(name, pa.array(np.repeat(values, agents)))
     return table
 
 
-def _agents_of(table: pa.Table) -> int:
-    """Return how many agents the episodes have; refuse rows that are not those of all, in order."""
+def _count_agents(table: pa.Table) -> int:
+    """Return the number of agents of an episode; refuse rows that are not whole episodes."""
     agent = table["agent"].to_numpy()
     agents = int(agent.max()) + 1
     is_whole = np.array_equal(agent, np.arange(len(agent)) % agents)
     if is_whole and {"harvest", COLLECTIVE_RETURN} <= {*table.column_names}:
-        apples = table["harvest"].to_numpy().astype(np.float64).reshape(-1, agents).sum(-1)
-        is_whole = np.allclose(apples, table[COLLECTIVE_RETURN].to_numpy()[::agents], rtol=1e-5)
+        # Rows that were chosen or sorted may still count 0, 1, 0, 1, but mix agents of different episodes.
+        harvests = table["harvest"].to_numpy().astype(np.float64).reshape(-1, agents).sum(-1)
+        is_whole = np.allclose(harvests, table[COLLECTIVE_RETURN].to_numpy()[::agents], rtol=1e-5)
     if not is_whole:
         raise ValueError(
             "the rows are not whole episodes, each of all agents in order; allowed: a table of one game that "
@@ -85,143 +95,162 @@ def _agents_of(table: pa.Table) -> int:
     return agents
 
 
-def naming(table: pa.Table, agents: Sequence[str]) -> pa.Table:
-    """Return a table whose metadata say what its game calls the agents, see `agents_named`."""
-    metadata = {**(table.schema.metadata or {}), _NAMES: "\n".join(agents).encode()}
+def store_agent_names(table: pa.Table, agents: Sequence[str]) -> pa.Table:
+    """Return the table with the names that the game gives its agents in the metadata, for `display_name`."""
+    metadata = {**(table.schema.metadata or {}), _AGENT_NAMES: "\n".join(agents).encode()}
     return table.replace_schema_metadata(metadata)
 
 
-def agents_named(table: pa.Table, number: str) -> str:
-    """Return a number by what the game calls its agent, e.g. "ann/return" for "agent_0/return"."""
-    who, _, what = number.rpartition("/")
-    names = (table.schema.metadata or {}).get(_NAMES, b"").decode().splitlines()
-    if not names or not who.startswith(_AGENT):
-        return number
-    return f"{names[int(who.removeprefix(_AGENT))]}/{what}"
+def display_name(table: pa.Table, metric: str) -> str:
+    """Return the name of a metric for readers: "ann/return" for "agent_0/return", if the game calls its first
+    agent "ann"."""
+    agent, _, total = metric.rpartition("/")
+    names = (table.schema.metadata or {}).get(_AGENT_NAMES, b"").decode().splitlines()
+    if not names or not agent.startswith(_AGENT):
+        return metric
+    return f"{names[int(agent.removeprefix(_AGENT))]}/{total}"
 
 
 def where(table: pa.Table, **labels: object) -> pa.Table:
-    """Return the rows with these labels; a tuple stands for any of them."""
+    """Return the rows in which each of these columns has the given value, or one of a tuple of values."""
     for name, value in labels.items():
-        each = value if isinstance(value, tuple) else (value,)
-        table = table.filter(pc.is_in(table[name], pa.array(each)))
+        values = value if isinstance(value, tuple) else (value,)
+        table = table.filter(pc.is_in(table[name], pa.array(values)))
     return table
 
 
 Label = Mapping[str, str | int]
-"""What was played: the values of the first columns of a table, by name."""
+"""The labels of rows, by column: they say what was played."""
 
 
 def labelled(table: pa.Table, **labels: object) -> pa.Table:
-    """Return a table with these columns first, each of one value."""
-    for place, (name, value) in enumerate(labels.items()):
-        kind = pa.int32() if isinstance(value, int) else None
-        table = table.add_column(place, name, pa.array([value] * len(table), kind))
+    """Return the table with labels as its first columns, the same in all rows; integers become int32."""
+    for position, (name, value) in enumerate(labels.items()):
+        dtype = pa.int32() if isinstance(value, int) else None
+        table = table.add_column(position, name, pa.array([value] * len(table), dtype))
     return table
 
 
 def labels_of(table: pa.Table) -> list[str]:
-    """Return the columns before the replica: what was played."""
+    """Return the names of the labels: the columns before the replica."""
     return list(table.column_names[: table.column_names.index("replica")])
 
 
-def metrics_in(schema: pa.Schema) -> list[str]:
-    """Return the stored metrics among the columns of a table, those of the user's own included."""
+def stored_metrics(schema: pa.Schema) -> list[str]:
+    """Return the metrics that a table stores as columns, those of the user included."""
     floats = [field.name for field in schema if pa.types.is_floating(field.type)]
-    counted = [name for name in METRICS if name in TOTALS and name in schema.names]
-    return [*(name for name in floats if name not in TOTALS), *counted]
+    totals_too = [name for name in METRICS if name in TOTALS and name in schema.names]
+    return [*(name for name in floats if name not in TOTALS), *totals_too]
 
 
-def numbers_in(table: pa.Table) -> list[str]:
-    """Return the names of the numbers of whole episodes in a table in the order of pages: the social ones,
-    the user's own, those of institutions, and what was decided.
-
-    The income is among them where it is not the harvest.
+def all_metrics(table: pa.Table) -> list[str]:
+    """Return the metrics of whole episodes that a table stores or determines, in the order in which pages
+    show them: social metrics, the user's, those of institutions, decisions. The income is left out where it
+    equals the harvest.
     """
-    whole = complete(table)
-    columns = whole.column_names
-    if {INCOME, COLLECTIVE_RETURN} <= {*columns} and FINES not in columns:
-        income = whole[INCOME].to_numpy()
-        if np.allclose(income, whole[COLLECTIVE_RETURN].to_numpy(), rtol=1e-6, atol=1e-6, equal_nan=True):
+    full = complete(table)
+    columns = full.column_names
+    if {INCOME, COLLECTIVE_RETURN} <= {*columns} and FINES_TOTAL not in columns:
+        income = full[INCOME].to_numpy()
+        if np.allclose(income, full[COLLECTIVE_RETURN].to_numpy(), rtol=1e-6, atol=1e-6, equal_nan=True):
             columns = [name for name in columns if name != INCOME]
     known = [name for name in METRICS if name in columns]
-    own = [name for name in metrics_in(table.schema) if is_own(name)]
-    is_social = {name: not name.startswith(INSTITUTIONS) for name in known}
-    social = [name for name in known if is_social[name]]
-    of_institutions = [name for name in known if not is_social[name]]
-    return [*social, *own, *of_institutions, *(name for name in columns if name.startswith(IN_FORCE))]
+    custom = [name for name in stored_metrics(table.schema) if is_custom_metric(name)]
+    social = [name for name in known if not name.startswith(INSTITUTIONS)]
+    institutional = [name for name in known if name.startswith(INSTITUTIONS)]
+    decisions = [name for name in columns if name.startswith(IN_FORCE_PREFIX)]
+    return [*social, *custom, *institutional, *decisions]
 
 
-def episodes(table: pa.Table, number: str) -> pa.Table:
-    """Return a row for each episode: its labels, replica, world, episode, and the "value" of a number, null
-    where it is undefined."""
-    if number in METRICS and number not in table.column_names:
+def episodes(table: pa.Table, metric: str) -> pa.Table:
+    """Return one row for each episode: its labels, replica, world and episode, and the "value" of the metric,
+    null where it is undefined.
+
+    Raises:
+        KeyError: if the table does not have the metric.
+    """
+    if metric in METRICS and metric not in table.column_names:
         table = complete(table)
-    who, _, what = number.rpartition("/")
-    columns = table.column_names
-    agent = who.removeprefix(_AGENT)
-    if number in columns and not (number in TOTALS and TOTALS[number].axes):
-        rows = where(table, agent=0)
-        column = number
-    elif what in columns and who != agent and agent in map(str, table["agent"].unique().to_pylist()):
-        rows = where(table, agent=int(agent))
-        column = what
-    elif what in columns and who in (FOCAL, BACKGROUND) and ROLE in columns:
-        rows = where(table, **{ROLE: (who, BOTH)})
-        column = what
-    else:
-        raise KeyError(f"the table has no number {number}")
-    names = [*labels_of(table), *_INDICES[:3]]
+    rows, column = _rows_with(table, metric)
+    names = [*labels_of(table), *_EPISODE_KEYS]
     keys = [name for name in names if name in rows.column_names]
     values = pc.cast(rows[column], pa.float64())
     values = pc.if_else(pc.is_nan(values), None, values)
-    found = rows.select(keys).append_column("value", values)
-    if who not in (FOCAL, BACKGROUND):
-        return found
-    found = found.group_by(keys, use_threads=False).aggregate([("value", "mean")])
-    return found.rename_columns([*keys, "value"])
+    rows = rows.select(keys).append_column("value", values)
+    if metric == column or metric.startswith(_AGENT):
+        return rows
+    # Several agents have the same role: their mean.
+    rows = rows.group_by(keys, use_threads=False).aggregate([("value", "mean")])
+    return rows.rename_columns([*keys, "value"])
 
 
-def by_replica(table: pa.Table, number: str, by: Sequence[str] = ()) -> pa.Table:
-    """Return a row for each replica of each choice of labels: the mean "value" over the episodes in which a
-    number is defined, null where there are none, how many "episodes" there were, and in how many it is
+def _rows_with(table: pa.Table, metric: str) -> tuple[pa.Table, str]:
+    """Return the rows that hold a metric, and the column in which they hold it: for "agent_2/fines" the rows
+    of agent 2 and the column "fines"."""
+    columns = table.column_names
+    is_of_each_agent = metric in TOTALS and bool(TOTALS[metric].axes)
+    if metric in columns and not is_of_each_agent:
+        return where(table, agent=0), metric  # all agents of an episode have the same value
+    prefix, _, column = metric.rpartition("/")
+    if column in columns:
+        agents = {f"{_AGENT}{agent}": agent for agent in table["agent"].unique().to_pylist()}
+        if prefix in agents:
+            return where(table, agent=agents[prefix]), column
+        if prefix in (FOCAL, BACKGROUND) and ROLE in columns:
+            return where(table, **{ROLE: (prefix, BOTH)}), column
+    raise KeyError(f"the table has no metric {metric}")
+
+
+def by_replica(table: pa.Table, metric: str, by: Sequence[str] = ()) -> pa.Table:
+    """Return one row for each replica and choice of labels: the mean "value" over the episodes in which the
+    metric is defined, null if there are none; the number of "episodes"; and in how many of them the metric is
     "undefined".
 
     Args:
-        by: the labels that are kept apart; episodes of all others count together.
+        by: the labels that tell rows apart; episodes that differ in other labels count together.
+
+    Raises:
+        KeyError: if the table has no such label or metric.
     """
     unknown = [name for name in by if name not in table.column_names]
     if unknown:
         raise KeyError(f"the table has no label {', '.join(unknown)}; it has {', '.join(labels_of(table))}")
     keys = [*by, "replica"]
-    counts = ["episodes", "undefined"]
     if WINDOWS in table.column_names:
-        rows = where(table, metric=number)
-        defined = pc.cast(pc.subtract(rows[WINDOWS], rows["undefined"]), pa.float64())
-        sums = pc.if_else(pc.equal(defined, 0), 0.0, pc.multiply(rows["value"], defined))
-        parts = {"sum": sums, "defined": defined, "episodes": rows[WINDOWS], "undefined": rows["undefined"]}
-        rows = pa.table({**{name: rows[name] for name in keys}, **parts})
-        rows = rows.group_by(keys, use_threads=False).aggregate([(name, "sum") for name in parts])
-        rows = rows.rename_columns([*keys, *parts])
-        count = pc.if_else(pc.equal(rows["defined"], 0), None, rows["defined"])
-        return rows.select([*keys, *counts]).add_column(len(keys), "value", pc.divide(rows["sum"], count))
-    every = pc.CountOptions(mode="all")
-    null = pc.CountOptions(mode="only_null")
-    rows = episodes(table, number).group_by(keys, use_threads=False)
-    rows = rows.aggregate([("value", "mean"), ("value", "count", every), ("value", "count", null)])
-    return rows.rename_columns([*keys, "value", *counts])
+        return _by_replica_of_windows(where(table, metric=metric), keys)
+    return _by_replica_of_episodes(episodes(table, metric), keys)
 
 
-def clock_of(table: pa.Table) -> float:
-    """Return the steps of an episode that the clock ended, infinity where none was."""
-    columns = {*table.column_names}
-    if WINDOWS in columns or not {"terminated", "steps"} <= columns:
-        return inf
-    steps = table.filter(pc.invert(table["terminated"]))["steps"]
-    return float(pc.max(steps).as_py()) if len(steps) else inf
+def _by_replica_of_windows(windows: pa.Table, keys: Sequence[str]) -> pa.Table:
+    """Return the mean of the windows' values, each weighted by the episodes in which it is defined."""
+    defined = pc.cast(pc.subtract(windows[WINDOWS], windows["undefined"]), pa.float64())
+    sums = pc.if_else(pc.equal(defined, 0), 0.0, pc.multiply(windows["value"], defined))
+    amounts = {
+        "sum": sums,
+        "defined": defined,
+        "episodes": windows[WINDOWS],
+        "undefined": windows["undefined"],
+    }
+    rows = pa.table({**{name: windows[name] for name in keys}, **amounts})
+    rows = rows.group_by(keys, use_threads=False).aggregate([(name, "sum") for name in amounts])
+    rows = rows.rename_columns([*keys, *amounts])
+    weight = pc.if_else(pc.equal(rows["defined"], 0), None, rows["defined"])
+    means = pc.divide(rows["sum"], weight)
+    return rows.select([*keys, "episodes", "undefined"]).add_column(len(keys), "value", means)
+
+
+def _by_replica_of_episodes(rows: pa.Table, keys: Sequence[str]) -> pa.Table:
+    """Return the mean over the episodes in which the value is not null."""
+    count_all = pc.CountOptions(mode="all")
+    count_undefined = pc.CountOptions(mode="only_null")
+    groups = rows.group_by(keys, use_threads=False)
+    means = groups.aggregate(
+        [("value", "mean"), ("value", "count", count_all), ("value", "count", count_undefined)]
+    )
+    return means.rename_columns([*keys, "value", "episodes", "undefined"])
 
 
 def world_of(table: pa.Table) -> Int64:
-    """Return the world of each row; of a table that has none, the replica."""
+    """Return the world of each row, or its replica in tables without worlds."""
     name = "world" if "world" in table.column_names else "replica"
     return np.asarray(table[name].to_numpy().astype(np.int64))

@@ -10,23 +10,21 @@ import numpy as np
 import pyarrow as pa
 
 from cprl.measuring.table import labels_of, world_of
-from cprl.values.arrays import Float64, Int64
+from cprl.values.array_types import Float64, Int64
 
-LAST_EPISODES: Final = 30
-"""Those at the end of a training, unless somebody says how many."""
 SMOOTHED_EPISODES: Final = 100
-"""The window of running means in episodes, where nothing else is asked for."""
+"""The default window of running means, in episodes."""
 
 
 def last_of(table: pa.Table, number: int) -> pa.Table:
-    """Return the rows of the last episodes of each replica: as many of each of its W worlds, and so many of
-    all together, or the next multiple of W.
+    """Return the rows of the last `number` episodes of each replica, rounded up to equally many of each of
+    its W worlds.
 
-    The last that have ended, of all worlds, would be the longest ones where worlds began together. Where a
-    world has ended fewer, only as many of each world are there.
+    The last ones of all worlds together would be the longest, if worlds began together. If a world has ended
+    fewer episodes, fewer of each world are returned.
 
     Raises:
-        ValueError: if the table has labels, and so may be of several runs.
+        ValueError: if the table has labels, and so may hold several runs.
     """
     if labels := labels_of(table):
         raise ValueError(f"the table is labelled by {', '.join(labels)}; allowed: the episodes of one run")
@@ -35,18 +33,18 @@ def last_of(table: pa.Table, number: int) -> pa.Table:
     size = int(episode.max(initial=0)) + 1
     keys, row = np.unique(world * size + episode, return_inverse=True)
     lanes, counts = np.unique(keys // size, return_counts=True)
-    each = rounds_of(number, len(lanes) // len(np.unique(table["replica"].to_numpy())))
-    is_last = episodes_after(keys // size) < min(each, counts.min())
+    count = episodes_per_world(number, len(lanes) // len(np.unique(table["replica"].to_numpy())))
+    is_last = episodes_after(keys // size) < min(count, counts.min())
     return table.filter(pa.array(is_last[row]))
 
 
-def rounds_of(number: int, worlds: int) -> int:
-    """Return of how many episodes of each of W worlds a mean of so many episodes is."""
+def episodes_per_world(number: int, worlds: int) -> int:
+    """Return the episodes of each of W worlds in a mean over `number` episodes."""
     return -(-number // worlds)
 
 
 def episodes_after(world: Int64) -> Int64:
-    """Return how many later episodes its world has, of each episode of a replica, [E] in order."""
+    """Return for each episode of a replica how many later episodes its world has, [E] in order."""
     order = np.argsort(world, kind="stable")
     counts = np.unique(world, return_counts=True)[1]
     after = np.empty(len(world), np.int64)
@@ -55,27 +53,27 @@ def episodes_after(world: Int64) -> Int64:
 
 
 def mean_of_worlds(values: Float64, worlds: Int64, window: int) -> Float64:
-    """Return the mean of the last episodes at each episode of a replica, in which every world counts alike.
+    """Return the mean over the last episodes at each episode of a replica, in which every world counts alike.
 
     Args:
         values: [E], in the order in which episodes ended.
-        worlds: [E], that of each.
-        window: of so many episodes, or the next multiple of the number of worlds; in one world it is the
-            `running_mean`.
+        worlds: [E], the world of each.
+        window: the episodes of the mean, rounded up to a multiple of the number of worlds; in one world it is
+            the `running_mean`.
 
     Returns:
-        [E], at the last of the episodes that it is a mean of; NaN before each world has ended so many.
+        [E], each mean at its last episode; NaN until each world has ended enough episodes.
     """
     lanes, counts = np.unique(worlds, return_counts=True)
-    each = min(rounds_of(min(window, len(values)), len(lanes)), int(counts.min()))
+    count = min(episodes_per_world(min(window, len(values)), len(lanes)), int(counts.min()))
     if len(lanes) == 1:
-        return np.concatenate([np.full(each - 1, np.nan), running_mean(values, each)])
+        return np.concatenate([np.full(count - 1, np.nan), running_mean(values, count)])
     means = np.full((len(lanes), len(values)), np.nan)
     for lane, world in enumerate(lanes):
         ended = np.flatnonzero(worlds == world)
-        of_world = running_mean(values[ended], each)
-        latest = np.searchsorted(ended, np.arange(len(values)), side="right") - each
-        means[lane, latest >= 0] = of_world[latest[latest >= 0]]
+        curve = running_mean(values[ended], count)
+        latest = np.searchsorted(ended, np.arange(len(values)), side="right") - count
+        means[lane, latest >= 0] = curve[latest[latest >= 0]]
     return np.asarray(means.mean(0))
 
 
@@ -83,7 +81,7 @@ def running_mean(values: Float64, window: int = SMOOTHED_EPISODES) -> Float64:
     """Return means over `window` consecutive values, each at the position of the first,
     [..., len - window + 1].
 
-    With fewer values, the mean of all. Undefined values are skipped; NaN where no value is defined.
+    With fewer values, it is the mean of all. Undefined values are skipped; NaN if all are undefined.
     """
     window = min(window, values.shape[-1])
     is_defined = ~np.isnan(values)
@@ -97,7 +95,8 @@ def running_mean(values: Float64, window: int = SMOOTHED_EPISODES) -> Float64:
 
 
 def centres(values: Float64, window: int) -> Float64:
-    """The episode at the centre of each running mean over `window` of these values, [..., E] to [...]."""
+    """Return the episode at the centre of each running mean over `window` of these values, [..., E] to
+    [...]."""
     window = min(window, values.shape[-1])
     return np.arange(values.shape[-1] - window + 1) + (window - 1) / 2
 

@@ -2,13 +2,13 @@
 
 Modules, in the order in which one reads them:
     mlp            MLP: fully connected layers
-    convolutional  Conv: convolutions over rows and columns
-    recurrent      GRU, LSTM: a state that is kept from turn to turn
-    specification  Network: which of them an algorithm has; networks of your own
-    agent          several networks of one agent, values of joint actions
-    team           the networks of a team
-    stacked        the networks of many lanes as one
-    finite         whether weights are numbers
+    convolutional  Conv: convolutions over rows and columns, then fully connected layers
+    recurrent      GRU, LSTM: networks with a state that lasts from turn to turn
+    specification  Network: the network that an algorithm names, and how it is made; networks of your own
+    agent          AgentNetworks: the networks of one agent; JointNetwork: values of joint actions
+    team           the networks of a team's members as one, central critics, mixing networks
+    stacked        the networks of many lanes as one, computed together
+    finite         find NaN and infinite numbers in weights
 """
 
 from cprl.networks.agent import AgentNetworks

@@ -1,4 +1,5 @@
-"""Networks made of others: several of one agent, values of joint actions."""
+"""Networks of one agent that are made of other networks: `AgentNetworks`, several that are trained together,
+and `JointNetwork`, a policy from the values of joint actions."""
 
 from typing import ClassVar
 
@@ -6,27 +7,31 @@ from torch import Tensor, nn
 
 
 class AgentNetworks(nn.ModuleDict):
-    """Networks of one agent that are trained together, by name; the first one acts."""
+    """The networks of one agent that are trained together, by name, e.g. "actor" and "critic".
+
+    The first one acts: it chooses the agent's actions.
+    """
 
     @property
     def stacks_over(self) -> tuple[str, ...]:
-        """See `cprl.networks.stacked.stack_lanes`."""
+        """Return the names of the networks, each of which is stacked by itself, see
+        `cprl.networks.stacked.stack_lanes`."""
         return tuple(self.keys())
 
     def forward(self, observation: Tensor) -> Tensor:
-        """The output of the acting network."""
-        given: Tensor = acting_part(self)(observation)
-        return given
+        """Return the output of the acting network."""
+        return acting_network(self)(observation)
 
 
-def parts_of(network: nn.Module) -> dict[str, nn.Module]:
-    """The networks of one agent by name, the acting one first; a single network has the name ""."""
+def networks_by_name(network: nn.Module) -> dict[str, nn.Module]:
+    """Return the networks of one agent by name, the acting one first; a network that is the agent's only one
+    has the name ""."""
     return dict(network.items()) if isinstance(network, AgentNetworks) else {"": network}
 
 
-def acting_part(network: nn.Module) -> nn.Module:
-    """The network that acts."""
-    return next(iter(parts_of(network).values()))
+def acting_network(network: nn.Module) -> nn.Module:
+    """Return the network by which an agent acts, the first of its networks."""
+    return next(iter(networks_by_name(network).values()))
 
 
 class JointNetwork(nn.Module):
@@ -48,27 +53,30 @@ class JointNetwork(nn.Module):
 
     def __init__(self, network: nn.Module, *, actions: int, peers: int, temperature: float) -> None:
         super().__init__()
-        self.network, self.actions, self.peers = network, actions, peers
+        self.network = network
+        self.actions = actions
+        self.peers = peers
         self.temperature = temperature
 
     def joint_values(self, observation: Tensor) -> Tensor:
-        """[..., *shape] to the values of pairs, [..., N - 1, A, A]: own action, then that of the peer."""
-        return self.network(observation).unflatten(-1, (self.peers, self.actions, self.actions))  # type: ignore[no-any-return]
+        """Map observations [..., *shape] to the values of pairs of actions, [..., N - 1, A, A]: the agent's
+        own action is the row, the peer's the column."""
+        return self.network(observation).unflatten(-1, (self.peers, self.actions, self.actions))
 
     def forward(self, observation: Tensor) -> Tensor:
-        """[..., *shape] to the logits of the policy, [..., A]."""
-        # As `cprl.objectives.pr2.marginal` has it, to the last bit.
+        """Map observations [..., *shape] to the logits of the policy, [..., A]."""
+        # The same operations in the same order as `cprl.objectives.pr2.marginal`, so equal to the last bit.
         scaled = self.joint_values(observation) / self.temperature
         return self.temperature * scaled.logsumexp(-1).sum(-2) / self.temperature
 
 
-class OtherOutputs(nn.Module):
-    """A network whose outputs are those of another method of it, e.g. "joint_values"; shares its weights."""
+class MethodModule(nn.Module):
+    """A module that calls another method of a network, e.g. "joint_values", and shares its weights."""
 
     def __init__(self, network: nn.Module, method: str) -> None:
         super().__init__()
-        self.of, self._method = network, method
+        self.of = network  # a part of the weights' names in checkpoints
+        self._method = method
 
     def forward(self, observation: Tensor) -> Tensor:
-        outputs: Tensor = getattr(self.of, self._method)(observation)
-        return outputs
+        return getattr(self.of, self._method)(observation)

@@ -1,4 +1,5 @@
-"""Convolutional networks over the rows and columns of an observation."""
+"""Convolutional networks over the rows and columns of an observation: `Conv`, what an algorithm's `network`
+says, and `ConvNetwork`, the torch module."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +10,7 @@ from typing import Annotated, Any, Unpack
 from torch import Tensor, nn
 
 from cprl.commons.spaces import Spaces
-from cprl.networks.mlp import MOST_CELLS, MOST_LAYERS, Layers, Options, glorot_uniform_, layers
+from cprl.networks.mlp import MOST_CELLS, MOST_LAYERS, Layers, Options, glorot_uniform_, make_layers
 from cprl.values import Value, Where
 
 Channels = Annotated[Layers, Where(bool, f"1 to {MOST_LAYERS} layers, each an integer in 1..{MOST_CELLS}")]
@@ -30,7 +31,15 @@ class Conv(Value):
     def make(
         self, spaces: Spaces, outputs: int, *, shape: Sequence[int] | None = None, **options: Unpack[Options]
     ) -> "ConvNetwork":
-        """Return a new network; raises a ValueError if observations have no rows and columns."""
+        """Return a new network.
+
+        Args:
+            outputs: the number of outputs.
+            shape: the shape of one input; None for that of observations.
+
+        Raises:
+            ValueError: if inputs have no rows and columns.
+        """
         shape = shape or spaces.observation_shape
         if len(shape) < 3:
             raise ValueError(
@@ -41,16 +50,19 @@ class Conv(Value):
 
 
 class ConvNetwork(nn.Module):
-    """The network of a `Conv`.
+    """Maps observations to a number of outputs by convolutions and fully connected layers.
 
     Args:
+        specification: says the layers.
         observation_shape: (C, X, Y), or (S, C, X, Y) for S observations, whose channels are concatenated.
+        outputs: the number of outputs: A for action values, 1 for a critic.
         highest: the largest value of an observation; inputs are divided by it.
+        relu_on_outputs: see `cprl.networks.mlp.Options`, also for `glorot_uniform`.
     """
 
     def __init__(
         self,
-        form: Conv,
+        specification: Conv,
         observation_shape: Sequence[int],
         outputs: int,
         *,
@@ -59,25 +71,30 @@ class ConvNetwork(nn.Module):
         glorot_uniform: bool = False,
     ) -> None:
         super().__init__()
-        self.highest, self.outputs, self.observation_dims = highest, outputs, len(observation_shape)
-        *planes, rows, columns = observation_shape
-        steps = list(pairwise((prod(planes), *form.channels)))
-        features = form.channels[-1] * rows * columns
-        self._window = prod(planes), rows, columns
+        self.highest = highest
+        self.outputs = outputs
+        self.observation_dims = len(observation_shape)
+        *channel_axes, rows, columns = observation_shape
+        in_channels = prod(channel_axes)
+        self._input_shape = in_channels, rows, columns
+        kernel = specification.kernel_cells
         self.convolutions = nn.ModuleList(
-            nn.Conv2d(before, after, form.kernel_cells, padding=form.kernel_cells // 2)
-            for before, after in steps
+            nn.Conv2d(channels, next_channels, kernel, padding=kernel // 2)
+            for channels, next_channels in pairwise((in_channels, *specification.channels))
         )
-        self.layers = layers(features, outputs, form.hidden_cells, relu_on_outputs=relu_on_outputs)
+        features = specification.channels[-1] * rows * columns
+        self.layers = make_layers(
+            features, outputs, specification.hidden_cells, relu_on_outputs=relu_on_outputs
+        )
         if glorot_uniform:
             self.apply(glorot_uniform_)
 
     def forward(self, observation: Tensor) -> Tensor:
-        """uint8 or float [..., C, X, Y] to [..., A], in the parameters' type."""
-        leading = observation.shape[: -self.observation_dims]
+        """Map observations, uint8 or float [..., C, X, Y], to [..., outputs], in the parameters' dtype."""
+        batch_shape = observation.shape[: -self.observation_dims]
         first: Any = self.convolutions[0]
-        values = observation.reshape(-1, *self._window).to(first.weight.dtype) / self.highest
+        features = observation.reshape(-1, *self._input_shape).to(first.weight.dtype) / self.highest
         for convolution in self.convolutions:
-            values = convolution(values).relu()
-        outputs: Tensor = self.layers(values.flatten(1))
-        return outputs.reshape(*leading, self.outputs)
+            features = convolution(features).relu()
+        outputs: Tensor = self.layers(features.flatten(1))
+        return outputs.reshape(*batch_shape, self.outputs)

@@ -1,4 +1,4 @@
-"""Whether weights are numbers: NaN and infinite ones are found."""
+"""Find NaN and infinite numbers in weights and other tensors."""
 
 from collections.abc import Iterable, Sequence
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 
 def all_finite(tensors: Iterable[Tensor]) -> bool:
-    """Whether no number in tensors of any shapes and dtypes is NaN or infinite; reads each once."""
+    """Return whether no number in some tensors, of any shapes and dtypes, is NaN or infinite."""
     floats = [tensor for tensor in tensors if tensor.is_floating_point() and tensor.numel()]
     if not floats:
         return True
@@ -15,17 +15,17 @@ def all_finite(tensors: Iterable[Tensor]) -> bool:
 
 
 def finite_lanes(tensors: Sequence[Tensor]) -> Tensor:
-    """Whether no number of a lane is NaN or infinite, bool [L], in the memory of the CPU.
+    """Return for each lane whether none of its numbers is NaN or infinite, bool [L], on the CPU.
 
     Args:
-        tensors: of L lanes, [L, ...] each, at least one of floating-point numbers.
+        tensors: [L, ...] each; at least one has floating-point numbers.
     """
     tensors = [tensor.detach() for tensor in tensors if tensor.is_floating_point()]
-    # A sum is finite only if all its terms are; the terms are looked at where it is not, since the sum of
-    # finite ones can exceed the largest number.
+    # A sum is finite only if all its terms are, and is computed fast. A sum of finite terms can overflow, so
+    # the terms themselves are checked where a sum is not finite.
     sums = torch.stack([tensor.reshape(len(tensor), -1).sum(1) for tensor in tensors])
-    sound = sums.isfinite().all(0).cpu()
-    if not sound.all():
-        each = torch.stack([tensor.reshape(len(tensor), -1).isfinite().all(1) for tensor in tensors])
-        sound = each.all(0).cpu()
-    return sound
+    are_finite = sums.isfinite().all(0).cpu()
+    if not are_finite.all():
+        by_tensor = torch.stack([tensor.reshape(len(tensor), -1).isfinite().all(1) for tensor in tensors])
+        are_finite = by_tensor.all(0).cpu()
+    return are_finite

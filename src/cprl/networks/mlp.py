@@ -1,4 +1,4 @@
-"""Fully connected networks."""
+"""Fully connected networks: `MLP`, what an algorithm's `network` says, and `MLPNetwork`, the torch module."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,27 +12,31 @@ from cprl.commons.spaces import Spaces
 from cprl.values import Range, Value, Where
 
 MOST_LAYERS: Final = 64
+"""The largest number of hidden layers."""
 MOST_CELLS: Final = 2**16
-"""Of one layer."""
+"""The largest number of units of one layer."""
 
 Cells = Annotated[int, Range(1, MOST_CELLS)]
 Layers = Annotated[
     tuple[Cells, ...],
     Where(
-        lambda layers: len(layers) <= MOST_LAYERS,
+        lambda hidden_cells: len(hidden_cells) <= MOST_LAYERS,
         f"0 to {MOST_LAYERS} layers, each an integer in 1..{MOST_CELLS}",
     ),
 ]
-"""Units of each hidden layer; none is a linear network."""
+"""Units of each hidden layer, e.g. (32, 32); () is a linear network."""
 
 
 class Options(TypedDict, total=False):
-    """What algorithms say of the networks that they have made."""
+    """Options that algorithms pass to all of their networks.
+
+    Both reproduce details of the program that Wiatrak (2019) ran, see `cprl.learners.settings.DQNSettings`.
+    """
 
     relu_on_outputs: bool
-    """Whether the outputs pass through ReLU too, as in the program of the study."""
+    """True if the outputs pass through ReLU too, as they do in that program; else they do not."""
     glorot_uniform: bool
-    """Whether weights are initialised Glorot-uniform and biases to zero, as in the program of the study; else
+    """True if weights are initialised Glorot-uniform and biases to zero, as they are in that program; else by
     torch's default."""
 
 
@@ -46,23 +50,32 @@ class MLP(Value):
     def make(
         self, spaces: Spaces, outputs: int, *, shape: Sequence[int] | None = None, **options: Unpack[Options]
     ) -> "MLPNetwork":
-        """Return a new network of observations, or of inputs of another shape."""
-        shape, highest = shape or spaces.observation_shape, spaces.observation_scale
+        """Return a new network.
+
+        Args:
+            outputs: the number of outputs.
+            shape: the shape of one input; None for that of observations.
+        """
+        shape = shape or spaces.observation_shape
+        highest = spaces.observation_scale
         return MLPNetwork(shape, outputs, hidden_cells=self.hidden_cells, highest=highest, **options)
 
 
 class MLPNetwork(nn.Module):
-    """Action values from an observation: fully connected layers with ReLU.
+    """Maps observations to a number of outputs, e.g. action values: fully connected layers with ReLU.
 
     Args:
         observation_shape: (C, X, Y) of an observation, `Game.observation_shape`.
+        outputs: the number of outputs: A for action values, 1 for a critic.
+        hidden_cells: units of each hidden layer.
         highest: the largest value of an observation, `Observation.highest`; inputs are divided by it.
+        relu_on_outputs: see `Options`, also for `glorot_uniform`.
     """
 
     def __init__(
         self,
         observation_shape: Sequence[int],
-        actions: int,
+        outputs: int,
         *,
         hidden_cells: Sequence[int] = (32, 32),
         highest: float = 255.0,
@@ -70,36 +83,43 @@ class MLPNetwork(nn.Module):
         glorot_uniform: bool = False,
     ) -> None:
         super().__init__()
-        self.highest, self.relu_on_outputs = highest, relu_on_outputs
-        self.observation_dims, self.outputs = len(observation_shape), actions
-        self.layers = layers(prod(observation_shape), actions, hidden_cells, relu_on_outputs=relu_on_outputs)
+        self.highest = highest
+        self.relu_on_outputs = relu_on_outputs
+        self.observation_dims = len(observation_shape)
+        self.outputs = outputs
+        self.layers = make_layers(
+            prod(observation_shape), outputs, hidden_cells, relu_on_outputs=relu_on_outputs
+        )
         if glorot_uniform:
             self.apply(glorot_uniform_)
 
     @property
     def linears(self) -> list[nn.Linear]:
-        """The layers with weights, first to last."""
+        """Return the layers with weights, first to last."""
         return [layer for layer in self.layers if isinstance(layer, nn.Linear)]
 
     def forward(self, observation: Tensor) -> Tensor:
-        """uint8 [..., C, X, Y] to [..., A], in the parameters' type."""
-        seen = observation.flatten(-self.observation_dims).to(self.linears[0].weight.dtype) / self.highest
-        return self.layers(seen)  # type: ignore[no-any-return]
+        """Map observations, uint8 or float [..., C, X, Y], to [..., outputs], in the parameters' dtype."""
+        features = observation.flatten(-self.observation_dims)
+        scaled = features.to(self.linears[0].weight.dtype) / self.highest
+        return self.layers(scaled)
 
 
-def layers(inputs: int, outputs: int, cells: Sequence[int], *, relu_on_outputs: bool) -> modules.MLP:
+def make_layers(
+    inputs: int, outputs: int, hidden_cells: Sequence[int], *, relu_on_outputs: bool
+) -> modules.MLP:
     """Return fully connected layers with ReLU between them."""
     return modules.MLP(
         in_features=inputs,
         out_features=outputs,
-        num_cells=list(cells),
+        num_cells=list(hidden_cells),
         activation_class=nn.ReLU,
         activate_last_layer=relu_on_outputs,
     )
 
 
 def glorot_uniform_(module: nn.Module) -> None:
-    """Initialises a layer's weights Glorot-uniform and its biases to zero."""
+    """Initialise a layer's weights Glorot-uniform and its biases to zero."""
     if isinstance(module, nn.Linear | nn.Conv2d):
         nn.init.xavier_uniform_(module.weight)
         if module.bias is not None:

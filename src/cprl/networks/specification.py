@@ -1,4 +1,4 @@
-"""The network architecture of an algorithm, and the networks made from it."""
+"""`Network`, the architecture that an algorithm names, and `new_network`, which makes networks of it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -14,7 +14,8 @@ from cprl.networks.recurrent import GRU, LSTM
 from cprl.values import Custom
 
 Network: TypeAlias = MLP | Conv | GRU | LSTM
-"""A network of cprl. A network of your own is a `Custom`, called with (spaces, outputs) and its arguments."""
+"""An architecture that cprl has. For a network of your own say `Custom`: cprl calls its target with (spaces,
+outputs) and the arguments of the `Custom`."""
 
 
 def new_network(
@@ -25,14 +26,20 @@ def new_network(
     shape: Sequence[int] | None = None,
     **options: Unpack[Options],
 ) -> nn.Module:
-    """A new network from observations [..., *shape] to [..., outputs], initialised from torch's generator.
+    """Return a new network that maps observations [..., *shape] to [..., outputs].
 
-    That of a `GRU` or an `LSTM` also reads and returns a state, see `cprl.networks.recurrent`.
+    Its weights are drawn from torch's global generator. It has the attributes `outputs` and
+    `observation_dims`, the number of axes of one input. The network of a `GRU` or an `LSTM` also reads and
+    returns a state, see `cprl.networks.recurrent`.
 
     Args:
-        outputs: the number of outputs. The network gets the attributes `outputs` and `observation_dims`.
-        shape: the shape of its input if that is not one observation: (S, *observation_shape) for the central
+        network: the architecture.
+        outputs: the number of outputs.
+        shape: the shape of one input, if it is not one observation: (S, *observation_shape) for the central
             critic of S agents. A network of your own gets it as `spaces.observation_shape`.
+
+    Raises:
+        ValueError: if a network of your own cannot be made or called, or has other outputs.
     """
     if not isinstance(network, Custom):
         return network.make(spaces, outputs, shape=shape, **options)
@@ -46,31 +53,43 @@ def new_network(
     if shape is not None:
         spaces = replace(spaces, observation_shape=tuple(shape))
         name += " of a critic, whose observation has the members first,"
-    return _users_network(network, name, spaces, outputs)
+    return _custom_network(network, name, spaces, outputs)
 
 
-def _users_network(network: Custom, name: str, spaces: Spaces, outputs: int) -> nn.Module:
-    """A network that a user's own code makes, after a check that it reads observations."""
-    shape, dtype = spaces.observation_shape, spaces.observation_dtype
+def _custom_network(network: Custom, name: str, spaces: Spaces, outputs: int) -> nn.Module:
+    """Return a network that a user's own code makes, after one call of it with two observations of zeros.
+
+    Args:
+        name: names the network in messages.
+    """
+    shape = spaces.observation_shape
     network.resolve()
     try:
-        made = network.make(spaces, outputs)
+        module = network.make(spaces, outputs)
     except Exception as error:  # a user's network may raise anything
         raise ValueError(f"{name} cannot be made for observations of {shape}: {error}") from error
-    if not isinstance(made, nn.Module):
-        raise ValueError(f"{name} is a {type(made).__name__}; allowed: a torch.nn.Module")
-    was_training = made.training
+    if not isinstance(module, nn.Module):
+        raise ValueError(f"{name} is a {type(module).__name__}; allowed: a torch.nn.Module")
+    _check_outputs(module, name, spaces, outputs)
+    for attribute, value in {"outputs": outputs, "observation_dims": len(shape)}.items():
+        if not hasattr(module, attribute):
+            setattr(module, attribute, value)
+    return module
+
+
+def _check_outputs(module: nn.Module, name: str, spaces: Spaces, outputs: int) -> None:
+    """Raise a ValueError unless a network maps two observations to [2, outputs]."""
+    shape = spaces.observation_shape
+    dtype = spaces.observation_dtype
+    observations = torch.zeros(2, *shape, dtype=getattr(torch, dtype))
+    was_training = module.training
     try:
         with torch.no_grad():
-            given = made.eval()(torch.zeros(2, *shape, dtype=getattr(torch, dtype)))
-    except Exception as error:  # likewise
+            output = module.eval()(observations)
+    except Exception as error:  # its forward may raise anything, too
         raise ValueError(
             f"{name} cannot read observations [2, {', '.join(map(str, shape))}] of {dtype}: {error}"
         ) from error
-    if tuple(given.shape) != (2, outputs):
-        raise ValueError(f"{name} outputs {list(given.shape)} for two observations; allowed: [2, {outputs}]")
-    made.train(was_training)
-    for name, value in {"outputs": outputs, "observation_dims": len(shape)}.items():
-        if not hasattr(made, name):
-            setattr(made, name, value)
-    return made
+    if tuple(output.shape) != (2, outputs):
+        raise ValueError(f"{name} outputs {list(output.shape)} for two observations; allowed: [2, {outputs}]")
+    module.train(was_training)

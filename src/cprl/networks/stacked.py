@@ -1,4 +1,8 @@
-"""The networks of many lanes as one, whose parameters carry a lane axis."""
+"""The networks of many lanes as one network, so that all lanes are computed together.
+
+Lanes have networks of one architecture. `stack_lanes` stacks their parameters along a lane axis; `lane_state`
+takes the weights of one lane out again.
+"""
 
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
@@ -11,47 +15,46 @@ from cprl.networks.mlp import MLPNetwork
 
 
 class StackedMLP(nn.Module):
-    """L networks like `MLPNetwork` whose parameters carry a lane axis, [L, in, out] and [L, 1, out].
+    """L networks of one architecture, `MLPNetwork`, computed together by batched matrix products.
 
-    A lane is one agent of one replica. Lanes do not influence each other: output l depends on input l and
-    parameters l alone. R such stacks of S networks each stack to parameters [R, S, in, out], of L = R x S.
+    Parameters have a lane axis: matrices [L, in, out] and biases [L, 1, out]. A lane is one agent of one
+    replica. Lanes do not influence each other: output l depends on input l and parameters l alone.
+    R stacks of S networks each can be stacked once more, to parameters [R, S, in, out]; then L = R x S.
     """
 
     def __init__(self, networks: Sequence[MLPNetwork]) -> None:
         super().__init__()
         first = networks[0]
-        refuse_other_forms(
-            (network.highest, network.relu_on_outputs, *(layer.weight.shape for layer in network.linears))
-            for network in networks
+        refuse_mixed_architectures(
+            (network.highest, network.relu_on_outputs, parameter_shapes(network)) for network in networks
         )
-        self.highest, self.relu_on_outputs = first.highest, first.relu_on_outputs
-        self.observation_dims, self.outputs = first.observation_dims, first.outputs
+        self.highest = first.highest
+        self.relu_on_outputs = first.relu_on_outputs
+        self.observation_dims = first.observation_dims
+        self.outputs = first.outputs
         self._names = [name for name, layer in first.named_modules() if isinstance(layer, nn.Linear)]
-        layers = list(zip(*(network.linears for network in networks), strict=True))
-        self.weights = nn.ParameterList(
-            [torch.stack([layer.weight.detach().T for layer in lanes]).contiguous() for lanes in layers]
-        )
-        self.biases = nn.ParameterList(
-            [torch.stack([layer.bias.detach()[None] for layer in lanes]) for lanes in layers]
-        )
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        for layers in zip(*(network.linears for network in networks), strict=True):
+            self.weights.append(torch.stack([layer.weight.detach().T for layer in layers]).contiguous())
+            self.biases.append(torch.stack([layer.bias.detach()[None] for layer in layers]))
 
     @property
     def lane_axis(self) -> int:
-        """The place of the axis of S lanes: 0, or 1 after an axis of R stacks."""
+        """Return the index of the axis of lanes in the parameters: 0, or 1 after an axis of R stacks."""
         dims: int = self.weights[0].ndim
         return dims - 3
 
     def stacked(self, stacks: Sequence["StackedMLP"]) -> "StackedMLP":
-        """R such networks as one; copies."""
-        together = deepcopy(self)
-        for name in ("weights", "biases"):
-            by_layer = zip(*(getattr(stack, name) for stack in stacks), strict=True)
-            layers = [torch.stack([one.detach() for one in of_layer]) for of_layer in by_layer]
-            setattr(together, name, nn.ParameterList(layers))
-        return together
+        """Return R stacks as one stack with copies of their parameters, [R, S, ...]."""
+        stack_of_stacks = deepcopy(self)
+        stack_of_stacks.weights = _stack_each(stack.weights for stack in stacks)
+        stack_of_stacks.biases = _stack_each(stack.biases for stack in stacks)
+        return stack_of_stacks
 
     def lane_state(self, lane: int) -> dict[str, Tensor]:
-        """Copies of the weights of one lane, as the state dict of its `MLPNetwork`, or of its stack."""
+        """Return copies of the weights of one lane, as the state dict of its `MLPNetwork`; of R stacks, the
+        weights of one stack, as its state dict."""
         if self.lane_axis:
             return {name: value[lane].clone() for name, value in self.state_dict().items()}
         state = {}
@@ -61,79 +64,98 @@ class StackedMLP(nn.Module):
         return state
 
     def forward(self, observation: Tensor) -> Tensor:
-        """uint8 [L, C, X, Y] or [L, ..., C, X, Y] to [L, A] or [L, ..., A], in the parameters' type; [R, S]
-        in place of [L] of R stacks."""
-        weights, biases = ([layer.flatten(0, -3) for layer in group] for group in (self.weights, self.biases))
+        """Map the observations of lanes, [L, ..., C, X, Y], to outputs [L, ..., A], in the parameters' dtype;
+        R stacks have axes [R, S] in place of [L]."""
+        weights = [weight.flatten(0, -3) for weight in self.weights]
+        biases = [bias.flatten(0, -3) for bias in self.biases]
         flat = observation.flatten(-self.observation_dims)
-        values = flat.reshape(len(weights[0]), -1, flat.shape[-1]).to(weights[0].dtype) / self.highest
-        for place, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
-            values = torch.baddbmm(bias, values.relu() if place else values, weight)
+        features = flat.reshape(len(weights[0]), -1, flat.shape[-1]).to(weights[0].dtype) / self.highest
+        for depth, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
+            if depth > 0:
+                features = features.relu()
+            features = torch.baddbmm(bias, features, weight)
         if self.relu_on_outputs:
-            values = values.relu()
-        return values.reshape(*flat.shape[:-1], values.shape[-1])
+            features = features.relu()
+        return features.reshape(*flat.shape[:-1], features.shape[-1])
 
 
 class StackedModules(nn.Module):
-    """L networks of one architecture, vmapped over parameters with a lane axis, [L, ...]."""
+    """L networks of any one architecture, computed together by `torch.vmap`.
+
+    Parameters have a lane axis, [L, ...]. Networks with buffers, such as batch normalisation, are refused,
+    since lanes would share them.
+    """
 
     def __init__(self, networks: Sequence[nn.Module]) -> None:
         super().__init__()
         first: Any = networks[0]
         if next(first.buffers(), None) is not None:
             raise ValueError(f"a {type(first).__name__} has buffers; allowed: parameters alone")
-        refuse_other_forms(
-            tuple((name, value.shape) for name, value in network.named_parameters()) for network in networks
-        )
-        self.lanes, self.observation_dims = len(networks), int(first.observation_dims)
+        refuse_mixed_architectures(map(parameter_shapes, networks))
+        self.lanes = len(networks)
+        self.observation_dims = int(first.observation_dims)
         self.outputs = getattr(first, "outputs", None)
         self.state_shape = getattr(first, "state_shape", None)
         self._names = [name for name, _ in first.named_parameters()]
-        self.__dict__["form"] = deepcopy(first)  # not a submodule: this module's weights are the stacked ones
-        each = zip(*(network.parameters() for network in networks), strict=True)
-        self.weights = nn.ParameterList([torch.stack([one.detach() for one in lanes]) for lanes in each])
+        # No submodule: the parameters of this module are the stacked ones, not those of the template.
+        self.__dict__["template"] = deepcopy(first)
+        self.weights = _stack_each(network.parameters() for network in networks)
 
     def lane_state(self, lane: int) -> dict[str, Tensor]:
-        """Copies of the weights of one lane, as the state dict of its network."""
+        """Return copies of the weights of one lane, as the state dict of its network."""
         return {
             name: weight[lane].detach().clone()
             for name, weight in zip(self._names, self.weights, strict=True)
         }
 
     def forward(self, observation: Tensor, *recurrent: Tensor) -> Any:
-        """[L, ..., *shape], or flat [L x b, *shape], to the outputs of the networks; recurrent ones also read
-        and give what `cprl.networks.recurrent` says."""
-        dims = self.observation_dims
-        leading, shape = observation.shape[:-dims], observation.shape[-dims:]
+        """Map the observations of lanes, [L, ..., *shape], or flat [L x b, *shape], to the networks' outputs.
 
-        def output(weights: list[Tensor], *seen: Tensor) -> Any:
-            named = dict(zip(self._names, weights, strict=True))
-            return torch.func.functional_call(self.__dict__["form"], named, seen)
+        Recurrent networks also read a state and `is_init`, and return states, see `cprl.networks.recurrent`.
+        """
+        batch_shape = observation.shape[: -self.observation_dims]
+        observation_shape = observation.shape[len(batch_shape) :]
+        vmapped = torch.vmap(self._call_template)
+        if not recurrent:
+            by_lane = observation.reshape(self.lanes, -1, *observation_shape)
+            outputs = vmapped(list(self.weights), by_lane)
+            return outputs.reshape(*batch_shape, *outputs.shape[2:])
+        lane_shape = self.lanes, *((-1,) if len(batch_shape) == 1 else batch_shape[1:])
+        inputs = [
+            entry.reshape(*lane_shape, *entry.shape[len(batch_shape) :])
+            for entry in (observation, *recurrent)
+        ]
+        results = vmapped(list(self.weights), *inputs)
+        return tuple(result.reshape(*batch_shape, *result.shape[len(lane_shape) :]) for result in results)
 
-        if recurrent:
-            apart = self.lanes, *((-1,) if len(leading) == 1 else leading[1:])
-            by_lane = [
-                entry.reshape(*apart, *entry.shape[len(leading) :]) for entry in (observation, *recurrent)
-            ]
-            each = torch.vmap(output)(list(self.weights), *by_lane)
-            return tuple(given.reshape(*leading, *given.shape[len(apart) :]) for given in each)
-        given = torch.vmap(output)(list(self.weights), observation.reshape(self.lanes, -1, *shape))
-        return given.reshape(*leading, *given.shape[2:])
+    def _call_template(self, weights: list[Tensor], *inputs: Tensor) -> Any:
+        """Return the outputs of one lane's network, by its weights in the order of `self._names`."""
+        by_name = dict(zip(self._names, weights, strict=True))
+        return torch.func.functional_call(self.__dict__["template"], by_name, inputs)
 
 
 def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
-    """One network with the parameters of all lanes along a lane axis; copies."""
+    """Return one network with copies of the parameters of all lanes along a lane axis.
+
+    Its class depends on the networks of the lanes: what their method `stacked` returns, if they have one; a
+    `StackedMLP` of `MLPNetwork`s; a network of the same class whose inner networks are stacked, where the
+    class names these in `stacks_over`; else a `StackedModules`.
+
+    Raises:
+        ValueError: if the lanes' networks have several architectures, or cannot be stacked.
+    """
     first: Any = networks[0]
     if hasattr(first, "stacked"):
-        itself: nn.Module = first.stacked(networks)
-        return itself
-    if _over(first) and all(type(network) is type(first) for network in networks):
+        return first.stacked(networks)
+    inner_names = _inner_networks(first)
+    if inner_names and all(type(network) is type(first) for network in networks):
         stack: Any = deepcopy(first)
-        for part in _over(first):
-            setattr(stack, part, stack_lanes([getattr(network, part) for network in networks]))
+        for name in inner_names:
+            setattr(stack, name, stack_lanes([getattr(network, name) for network in networks]))
         for name, _ in first.named_parameters(recurse=False):
             weights = torch.stack([getattr(network, name).detach() for network in networks])
             setattr(stack, name, nn.Parameter(weights))
-        return stack  # type: ignore[no-any-return]
+        return stack
     if all(isinstance(network, MLPNetwork) for network in networks):
         return StackedMLP(networks)  # type: ignore[arg-type]
     if not all(hasattr(network, "observation_dims") for network in networks):
@@ -144,31 +166,46 @@ def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
 
 
 def lane_state(stack: nn.Module, lane: int) -> dict[str, Tensor]:
-    """Copies of the weights of one lane of an acting network that `stack_lanes` made, as the state dict of
-    the lane's network."""
-    if _over(stack):
-        weights = {
-            name: value[lane].detach().clone() for name, value in stack.named_parameters(recurse=False)
-        }
-        buffers = {name: value.clone() for name, value in stack.named_buffers(recurse=False)}
-        inner = {
-            f"{part}.{name}": value
-            for part in _over(stack)
-            for name, value in lane_state(getattr(stack, part), lane).items()
-        }
-        return {**weights, **buffers, **inner}
-    state: dict[str, Tensor] = stack.lane_state(lane)  # type: ignore[operator]
-    return state
+    """Return copies of the weights of one lane of a network that `stack_lanes` made, as the state dict of the
+    lane's network."""
+    inner_names = _inner_networks(stack)
+    if not inner_names:
+        return stack.lane_state(lane)  # type: ignore[operator]
+    weights = {name: value[lane].detach().clone() for name, value in stack.named_parameters(recurse=False)}
+    buffers = {name: value.clone() for name, value in stack.named_buffers(recurse=False)}
+    inner_weights = {
+        f"{inner_name}.{name}": value
+        for inner_name in inner_names
+        for name, value in lane_state(getattr(stack, inner_name), lane).items()
+    }
+    return {**weights, **buffers, **inner_weights}
 
 
-def _over(network: Any) -> list[str]:
-    """The attributes of a network that computes with the outputs of others: `stacks_over` of its class names
-    them, and its own weights get a lane axis in front."""
+def _inner_networks(network: Any) -> list[str]:
+    """Return the names of the attributes that hold the inner networks of a network.
+
+    A network that computes with the outputs of other networks names them in its attribute `stacks_over`.
+    Each is stacked by itself; the network's remaining parameters get a lane axis in front.
+    """
     names = getattr(network, "stacks_over", ())
     return [name for name in names if getattr(network, name) is not None]
 
 
-def refuse_other_forms(forms: Iterable[object]) -> None:
-    """Raises a ValueError unless all networks of a stack are of one form."""
-    if (count := len(set(forms))) != 1:
+def _stack_each(lists: Iterable[Iterable[Tensor]]) -> nn.ParameterList:
+    """Return copies of tensors, stacked: the first tensors of all lists, their second ones, and so on."""
+    stacks = nn.ParameterList()
+    for tensors in zip(*lists, strict=True):
+        stacks.append(torch.stack([tensor.detach() for tensor in tensors]))
+    return stacks
+
+
+def parameter_shapes(network: nn.Module) -> tuple[tuple[str, torch.Size], ...]:
+    """Return the name and the shape of each parameter of a network."""
+    return tuple((name, value.shape) for name, value in network.named_parameters())
+
+
+def refuse_mixed_architectures(architectures: Iterable[object]) -> None:
+    """Raise a ValueError unless all networks of a stack have one architecture, given as a hashable value for
+    each network."""
+    if (count := len(set(architectures))) != 1:
         raise ValueError(f"the networks of the lanes have {count} architectures; allowed: 1")

@@ -1,13 +1,14 @@
-"""What agents want, and losses that TorchRL lacks: each a `torchrl.objectives.LossModule` that works without
-the rest of cprl.
+"""The objectives of learning: shaped rewards, and losses that TorchRL lacks.
+
+Each loss is a `torchrl.objectives.LossModule` that also works without the rest of cprl.
 
 Modules, in the order in which one reads them:
-    rewards      the reward that each agent learns from, out of those of everybody
+    rewards      Reward: the reward that an agent learns from, computed from the rewards of all agents
     functional   a TorchRL loss as a function of its weights, for updates of many agents at once
-    td           ln cosh of an error, and TorchRL's DQN loss with it; losses that bootstrap by one step
+    td           the log-cosh loss, TorchRL's DQN loss with it, and the base of losses with one-step targets
     maddpg       MADDPGLoss: an actor and a centralised critic for each of several agents
-    pr2          probabilistic recursive reasoning: joint action values, the peers' expected answers
-    lola         losses that look one learning step of the others ahead, by policy gradients and by DiCE
+    pr2          PR2Loss: values of joint actions, with the answers that an agent expects of its peers
+    lola         LOLALoss, LOLADiCELoss: losses after the learning step that the others are expected to take
 """
 
 from cprl.objectives.lola import (

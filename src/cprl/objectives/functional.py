@@ -1,4 +1,5 @@
-"""A TorchRL loss as a function of its weights: their names, their targets, and what the loss returns."""
+"""TorchRL losses as functions of their weights, so that one loss can be computed with the weights of many
+lanes."""
 
 from collections.abc import Mapping
 from contextlib import suppress
@@ -10,9 +11,15 @@ from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from cprl.system.compat import forget_cached_weights, promise_targets, refuse_updaters, updated_weights
+from cprl.system.compat.torchrl import (
+    forget_cached_weights,
+    promise_targets,
+    refuse_updaters,
+    updated_weights,
+)
 
 Weights = dict[str, Tensor]
+"""The weights of a loss or a network by name."""
 
 _NO_UPDATER: Final = (
     "a SoftUpdate or HardUpdate was built on the {}; the learner has weights of its own, which it would not "
@@ -20,7 +27,8 @@ _NO_UPDATER: Final = (
 )
 
 
-_KEPT: Final = bool | int | float | Tensor
+_STATE_TYPES: Final = bool | int | float | Tensor
+"""The types of attributes of a loss that count as its state."""
 
 
 class FunctionalLoss:
@@ -36,67 +44,85 @@ class FunctionalLoss:
             loss.scalar_output_mode = "exclude"  # drops scalars that are not losses of transitions
         make_lazy_parts(loss)
         self._groups = {name: group.batch_size for name, group in groups_of(loss).items()}
-        self._singles = tuple(single_weights(loss))
-        for name in (*self._groups, *self._singles):
+        """The batch sizes of the groups of weights, by the attribute that holds the group."""
+        self._single_names = tuple(single_weights(loss))
+        """The attributes that hold weights in no group."""
+        for name in (*self._groups, *self._single_names):
             delattr(loss, name)
             setattr(loss, name, None)
         refuse_updaters(loss, _NO_UPDATER.format(type(loss).__name__))
         self.module = loss
 
     def __call__(self, params: Weights, targets: Weights, batch: TensorDict) -> Tensor:
-        """The loss of each transition, [L, b], or [b] under vmap; a single number if the loss reduces it."""
-        flat = {**params, **targets}
+        """Return the loss of each transition, [L, b], or [b] under vmap; one number if the loss averages it.
+
+        Args:
+            params: the weights that are trained, named as by `named_weights`.
+            targets: the other weights.
+        """
+        weights = {**params, **targets}
         for name, size in self._groups.items():
             prefix = f"{name}:"
-            group = {key.removeprefix(prefix): flat[key] for key in flat if key.startswith(prefix)}
+            group = {key.removeprefix(prefix): weights[key] for key in weights if key.startswith(prefix)}
             setattr(self.module, name, TensorDict(group, size).unflatten_keys("."))
-        for name in self._singles:
+        for name in self._single_names:
             setattr(self.module, name, params[name])
         if not torch.compiler.is_compiling():
             forget_cached_weights(self.module)
         losses = total(self.module(batch), self.module)
-        for name in (*self._groups, *self._singles):
+        for name in (*self._groups, *self._single_names):
             setattr(self.module, name, None)
         return losses
 
-    def kept(self) -> dict[str, Any]:
-        """What the loss keeps from call to call: buffers, and attributes that are numbers or tensors."""
+    def call_state(self) -> dict[str, Any]:
+        """Return the state that the loss keeps from one call to the next: its buffers, and its attributes
+        that are numbers or tensors."""
         return {"buffers": dict(self.module.named_buffers()), "attributes": attributes_of(self.module)}
 
-    def keep(self, kept: Mapping[str, Any]) -> None:
-        """Continues with what `kept` returned."""
+    def load_call_state(self, state: Mapping[str, Any]) -> None:
+        """Continue from a state that `call_state` returned."""
         for name, buffer in self.module.named_buffers():
-            buffer.copy_(kept["buffers"][name])
-        set_attributes(self.module, kept["attributes"])
+            buffer.copy_(state["buffers"][name])
+        set_attributes(self.module, state["attributes"])
 
 
 def make_lazy_parts(loss: LossModule) -> None:
-    """Makes what a loss creates at first access, which would look like a change by a call."""
+    """Make the attributes that a loss creates at first access, so that they do not look like changes by a
+    call."""
     getattr(loss, "in_keys", None)
-    with suppress(NotImplementedError):  # a loss may have none
+    with suppress(NotImplementedError):  # a loss may have no value estimator
         getattr(loss, "value_estimator", None)
 
 
 def attributes_of(loss: LossModule) -> dict[str, Any]:
-    """The attributes of a loss that are numbers or tensors, which it may change from call to call."""
-    return {name: value for name, value in vars(loss).items() if isinstance(value, _KEPT)}
+    """Return the attributes of a loss that are numbers or tensors, which it may change from call to call."""
+    return {name: value for name, value in vars(loss).items() if isinstance(value, _STATE_TYPES)}
 
 
 def set_attributes(loss: LossModule, attributes: Mapping[str, Any]) -> None:
-    """Sets what `attributes_of` returned."""
+    """Set the attributes of a loss to those that `attributes_of` returned."""
     for name, value in attributes.items():
-        setattr(loss, name, value.clone() if isinstance(value, Tensor) else value)
+        copy = value.clone() if isinstance(value, Tensor) else value
+        setattr(loss, name, copy)
 
 
-def own_targets(loss: LossModule) -> None:
-    """Marks the targets of a loss as updated, by the learner, so that TorchRL does not warn."""
+def mark_targets_updated(loss: LossModule) -> None:
+    """Tell TorchRL that the learner updates the targets of a loss, so that it does not warn.
+
+    Raises:
+        ValueError: if the loss already has an updater of TorchRL's.
+    """
     if any(f"target_{name}_params" in groups_of(loss) for name in updated_weights(loss)):
         raise ValueError(_NO_UPDATER.format(type(loss).__name__))
     promise_targets(loss)
 
 
 def total(out: Any, loss: LossModule) -> Tensor:
-    """The sum of all entries that TorchRL calls a loss."""
+    """Return the sum of all losses in the output of a loss module: the entries that begin with "loss".
+
+    Raises:
+        ValueError: if the output has no such entry.
+    """
     entries = dict(out.items()) if is_tensor_collection(out) else {}
     losses = [value for name, value in entries.items() if name.startswith("loss")]
     if not losses:
@@ -106,29 +132,29 @@ def total(out: Any, loss: LossModule) -> Tensor:
             f"the loss {kind.__module__}:{kind.__qualname__} returns a {type(out).__name__}{has}; allowed: "
             'a TensorDict with entries whose names begin with "loss"'
         )
-    summed: Tensor = sum(losses[1:], losses[0])
-    return summed
+    return sum(losses[1:], losses[0])
 
 
 def groups_of(loss: LossModule) -> dict[str, TensorDictParams]:
-    """The groups of weights of a loss by name, including targets."""
-    named = loss.named_modules(remove_duplicate=False)
-    return {name: group for name, group in named if isinstance(group, TensorDictParams) and "." not in name}
+    """Return the groups of weights of a loss by name, including targets."""
+    modules = loss.named_modules(remove_duplicate=False)
+    return {name: group for name, group in modules if isinstance(group, TensorDictParams) and "." not in name}
 
 
 def single_weights(loss: LossModule) -> dict[str, nn.Parameter]:
-    """The weights of a loss that are in no group, by name; `LossModule.named_parameters` omits some."""
+    """Return the weights of a loss that are in no group, by name; `LossModule.named_parameters` omits
+    some of them."""
     return dict(nn.Module.named_parameters(loss, recurse=False, remove_duplicate=False))
 
 
 def targets_of(loss: LossModule) -> dict[str, TensorDictParams]:
-    """The groups of weights that have targets, by name."""
+    """Return the groups of weights that have targets, by name."""
     groups = groups_of(loss)
     return {name: group for name, group in groups.items() if f"target_{name}" in groups}
 
 
 def named_weights(loss: LossModule) -> Weights:
-    """All weights of a loss, not copied, by "group:name"; weights in no group by their name."""
+    """Return all weights of a loss, not copied, by name: "group:name", or "name" for weights in no group."""
     grouped = {
         f"{group}:{key}": value
         for group, weights in groups_of(loss).items()
@@ -138,5 +164,5 @@ def named_weights(loss: LossModule) -> Weights:
 
 
 def weights_of(loss: LossModule) -> Weights:
-    """Copies of all weights of a loss, including targets, by name."""
+    """Return copies of all weights of a loss, including targets, by name."""
     return {name: value.detach().clone() for name, value in named_weights(loss).items()}

@@ -1,4 +1,5 @@
-"""PR2Loss: probabilistic recursive reasoning for discrete actions, an agent's values of joint actions."""
+"""PR2Loss: the loss of an agent that values joint actions and expects its peers to answer its own action, for
+discrete actions (probabilistic recursive reasoning)."""
 
 from dataclasses import dataclass
 from math import log
@@ -9,39 +10,45 @@ from tensordict.nn import TensorDictModule, TensorDictParams
 from tensordict.utils import NestedKey, unravel_key
 from torch import Tensor, nn
 
-from cprl.objectives.td import TDLoss, distance
+from cprl.objectives.td import TDLoss, td_distance
 
 
 class PR2Loss(TDLoss):
-    """The loss of PR2-Q: an agent expects its peers to answer each of its actions, and learns what that pays.
+    """The loss of PR2-Q: an agent learns the values of joint actions, and by them expects its peers' answers.
 
-    The network values joint actions by pairs, q_j(s, a, b): the agent's own action and that of peer j; the
-    value of a joint action is their sum. With temperature T the peers' expected answer is
-    rho(b | s, a) ~ exp(q_j(s, a, b) / T), the value of an own action Q(s, a) = T log sum exp(Q(s, a, others)
-    / T) over the others' joint actions, and the policy pi(a | s) ~ exp(Q(s, a) / T); see
-    `marginal`. The loss is the squared difference between the value of the joint action taken and
-    r + gamma V(s'), where V is the soft value of the target network, T log sum exp(Q(s', a) / T).
+    The network values pairs of actions, q_j(s, a, b): a is the agent's own action, b that of peer j. The
+    value of a joint action is the sum over the peers. With temperature T:
+
+    - the expected answer of peer j is rho(b | s, a) ~ exp(q_j(s, a, b) / T);
+    - the value of an own action is Q(s, a) = T log sum exp(Q(s, a, others) / T), over the joint actions of
+      the others, see `marginal`;
+    - the policy is pi(a | s) ~ exp(Q(s, a) / T).
+
+    The loss is the squared difference between the value of the joint action that was taken and
+    r + gamma V(s'), where V is the soft value by the target network, V(s') = T log sum exp(Q(s', a) / T).
 
     The model of the peers is optimistic: they are expected to do what the agent values, whatever they value.
     In the game of payoffs [[0, 3], [1, 2]] against [[3, 2], [0, 1]], at T = 1, the agent of the rows plays
     (0.676, 0.324), not the equilibrium (0.5, 0.5).
 
     Source: Wen, Yang, Luo, Wang and Pan, "Probabilistic Recursive Reasoning for Multi-Agent Reinforcement
-    Learning" (ICLR 2019), algorithm PR2-Q; departures are numbered in docs/opponents.md.
+    Learning" (ICLR 2019), algorithm PR2-Q; `cprl.algorithms.PR2` lists the departures.
 
     Args:
         value_network: maps observations to the values of pairs, float [..., N - 1, A, A]: a
-            `TensorDictModule` whose first output they are, or a module that reads "observation".
+            `TensorDictModule` with them as its first output, or a module that reads "observation".
         temperature: T, in units of reward, above 0.
-        entropy_bonus: whether soft values contain T times the entropy of the joint action, as in the paper:
-            up to T log A for each agent and step, which pays them for living on. Else the sums are means, by
-            which uniform play is worth what it is paid: lower by N T log A.
-        loss_function: of the temporal-difference error: "l2", "smooth_l1" (Huber), "l1" or "log_cosh".
+        entropy_bonus: whether soft values contain T times the entropy of the joint action, as in the paper.
+            That is up to T log A for each agent and step, which rewards agents for each step that they live.
+            If False, soft values are lower by N T log A: means replace sums, so that uniform play is worth
+            exactly its reward.
+        loss_function: the loss of the temporal-difference error: "l2", "smooth_l1" (Huber), "l1" or
+            "log_cosh".
         delay_value: whether soft values come from a target network.
         reduction: "none" (one loss per transition), "mean" or "sum".
 
-    Reads the observation, "action" int64 [..., N], the agent's own first, and under "next" the observation,
-    "reward" [..., 1], "done" and "terminated"; writes "td_error", the squared error [..., 1].
+    `forward` reads the observation; "action", int64 [..., N], the agent's own first; and under "next" the
+    observation, "reward" [..., 1], "done" and "terminated". It writes "td_error", the squared error [..., 1].
     """
 
     @dataclass
@@ -68,7 +75,9 @@ class PR2Loss(TDLoss):
     ) -> None:
         super().__init__()
         self.temperature = temperature
-        self.entropy_bonus, self.loss_function, self.reduction = entropy_bonus, loss_function, reduction
+        self.entropy_bonus = entropy_bonus
+        self.loss_function = loss_function
+        self.reduction = reduction
         self.delay_value = delay_value
         if not isinstance(value_network, TensorDictModule):
             value_network = TensorDictModule(value_network, ["observation"], ["joint_action_value"])
@@ -76,62 +85,65 @@ class PR2Loss(TDLoss):
 
     @property
     def in_keys(self) -> list[NestedKey]:
-        """The entries that `forward` reads."""
-        keys, seen = self.tensor_keys, list(self.value_network.in_keys)
-        after = [*seen, keys.reward, keys.done, keys.terminated]
-        return [keys.action, *seen, *(unravel_key(("next", key)) for key in after)]
+        """Return the entries that `forward` reads."""
+        keys = self.tensor_keys
+        network_keys = list(self.value_network.in_keys)
+        next_keys = [*network_keys, keys.reward, keys.done, keys.terminated]
+        return [keys.action, *network_keys, *(unravel_key(("next", key)) for key in next_keys)]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDict:
-        """The loss of a batch, under "loss"."""
+        """Return the loss of a batch, under "loss"."""
         keys = self.tensor_keys
-        value = chosen(
-            self.outputs_of("value_network", self.value_network_params, tensordict),
-            tensordict.get(keys.action),
-        )
+        joint = self.outputs_of("value_network", self.value_network_params, tensordict)
+        value = chosen_value(joint, tensordict.get(keys.action))
         target = self._target(tensordict)
         tensordict.set(keys.priority, (value.detach() - target).square().unsqueeze(-1))
-        loss = distance(value, target, self.loss_function)
+        loss = td_distance(value, target, self.loss_function)
         return TensorDict({"loss": self._reduce_loss(loss, tensordict=tensordict)})
 
     def _target(self, tensordict: TensorDictBase) -> Tensor:
-        """r + gamma V(s'), float [...]."""
+        """Return the target r + gamma V(s'), float [...]."""
         with torch.no_grad():
             joint = self.outputs_of("value_network", self.target_value_network_params, tensordict.get("next"))
-            following = soft_value(marginal(joint, self.temperature), self.temperature)
+            next_value = soft_value(marginal(joint, self.temperature), self.temperature)
             if not self.entropy_bonus:
-                agents, actions = joint.shape[-3] + 1, joint.shape[-1]
-                following = following - self.temperature * agents * log(actions)
-            estimated: Tensor = self.value_estimator.value_estimate(
-                tensordict, next_value=following.unsqueeze(-1)
+                agents = joint.shape[-3] + 1
+                next_value = next_value - self.temperature * agents * log(joint.shape[-1])
+            target: Tensor = self.value_estimator.value_estimate(
+                tensordict, next_value=next_value.unsqueeze(-1)
             )
-        return estimated.squeeze(-1)
+        return target.squeeze(-1)
 
 
 def marginal(joint: Tensor, temperature: float) -> Tensor:
-    """Return the value of an agent's own action: T log sum exp(Q(s, a, others) / T) over the joint actions of
-    the others.
+    """Return the values of an agent's own actions, float [..., A]: T log sum exp(Q(s, a, others) / T), summed
+    over the joint actions of the others.
 
-    Computed exactly: with pairs, float [..., N - 1, A, A], the sum over joint actions is a product of sums
-    over each peer's; float [..., A]. The agent expects that a peer answers with rho(b | s, a), which is
-    proportional to exp(q(s, a, b) / T): Wen et al., "Probabilistic Recursive Reasoning for Multi-Agent
+    The sum is exact: a joint action is valued by pairs, so the sum over joint actions is a product of the
+    sums over each peer's actions. Source: Wen et al., "Probabilistic Recursive Reasoning for Multi-Agent
     Reinforcement Learning" (2019).
+
+    Args:
+        joint: the values of pairs, float [..., N - 1, A, A].
+        temperature: T.
     """
     return temperature * (joint / temperature).logsumexp(-1).sum(-2)
 
 
-def chosen(joint: Tensor, action: Tensor) -> Tensor:
-    """Return the value of one joint action.
+def chosen_value(joint: Tensor, action: Tensor) -> Tensor:
+    """Return the value of one joint action, float [...].
 
     Args:
+        joint: the values of pairs, float [..., N - 1, A, A].
         action: int64 [..., N], the agent's own action first.
     """
     actions = joint.shape[-1]
-    action_of_agent = action[..., :1]
-    peers = action[..., 1:]
-    pairs = joint.flatten(-2).gather(-1, (action_of_agent * actions + peers).unsqueeze(-1))
-    return pairs.sum((-2, -1))
+    own_action = action[..., :1]
+    peer_actions = action[..., 1:]
+    pair_values = joint.flatten(-2).gather(-1, (own_action * actions + peer_actions).unsqueeze(-1))
+    return pair_values.sum((-2, -1))
 
 
 def soft_value(values: Tensor, temperature: float) -> Tensor:
-    """Return T log sum exp(values / T) over the last axis: [..., A] to [...]."""
+    """Return the soft value T log sum exp(values / T) over the last axis, from [..., A] to [...]."""
     return temperature * torch.logsumexp(values / temperature, -1)

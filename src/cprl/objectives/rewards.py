@@ -1,8 +1,8 @@
-"""What agents want: the reward that an agent learns from, out of the rewards of everybody.
+"""Shaped rewards: the rewards that agents learn from, computed from the rewards of all agents.
 
-In each of these, N is the number of agents, r_i the reward that the environment gives agent i in a turn
-(apples, less fines, plus transfers), and r'_i the reward that agent i wants and learns from. First come the
-values that a recipe says, each a `Reward`; then `RewardModel`, which computes what agents want turn by turn.
+A `Reward` says how an agent's reward is shaped; `RewardModel` computes shaped rewards turn by turn. In the
+formulas N is the number of agents, r_i the reward that the environment gives agent i in a turn (harvest -
+fines + transfers, in apples), and r'_i the shaped reward that agent i learns from.
 """
 
 from collections.abc import Mapping
@@ -15,17 +15,18 @@ import torch
 from torch import Tensor
 
 from cprl.values import Range, Share, Value, Where, checked
-from cprl.values.arrays import Float64
+from cprl.values.array_types import Float64
 
-Array = Any
-"""A numpy array, or a tensor."""
+_Array = Any
+"""A numpy array or a tensor."""
 Weight = Annotated[float, Range(0, 1e6)]
+"""The weight of a term of a shaped reward."""
 Angle = Annotated[float, Where(lambda angle: -pi <= angle <= pi, "radians in -pi..pi, e.g. math.radians(45)")]
 
 
 @dataclass(frozen=True, kw_only=True)
 class InequityAversion(Value):
-    """Dislikes having less than others, and having more.
+    """The reward of an agent that dislikes having less than others, and dislikes having more.
 
     r'_i = r_i - alpha / (N - 1) sum_j max(e_j - e_i, 0) - beta / (N - 1) sum_j max(e_i - e_j, 0), over the
     others j, with smoothed rewards e_i = smoothing x (e_i of the turn before) + r_i, zero before an episode's
@@ -35,88 +36,97 @@ class InequityAversion(Value):
     after Fehr and Schmidt (1999).
 
     Args:
-        alpha: the dislike of being behind (disadvantageous inequity); 5 is usual.
-        beta: the dislike of being ahead (advantageous inequity); 0.05 is usual.
-        smoothing: the share of smoothed rewards that lasts into the next turn; gamma x lambda of the
-            source. With 0 only the rewards of the turn are compared, with 1 the returns so far.
+        alpha: the weight of being behind (disadvantageous inequity); 5 is usual.
+        beta: the weight of being ahead (advantageous inequity); 0.05 is usual.
+        smoothing: the share of smoothed rewards that lasts into the next turn; gamma x lambda in the source.
+            0 compares the rewards of one turn, 1 the returns so far.
     """
 
     alpha: Weight
     beta: Weight
     smoothing: Share
 
-    def wanted(self, rewards: Float64, smoothed: Float64) -> Float64:
-        """What agents want who get these rewards, [B, N], and have these smoothed ones."""
-        # [B, one, other]: above 0 where one is behind
+    def shaped(self, rewards: Float64, smoothed: Float64) -> Float64:
+        """Return shaped rewards, [B, N].
+
+        Args:
+            rewards: [B, N], the rewards of a turn.
+            smoothed: [B, N], the smoothed rewards e_i after the turn.
+        """
+        # [B, i, j]: e_j - e_i, above 0 where agent i is behind agent j.
         difference = smoothed[:, None, :] - smoothed[:, :, None]
-        behind, ahead = difference.clip(min=0).sum(-1), (-difference).clip(min=0).sum(-1)
-        loss: Float64 = (self.alpha * behind + self.beta * ahead) / (rewards.shape[1] - 1)
-        return rewards - loss
+        behind = difference.clip(min=0).sum(-1)
+        ahead = (-difference).clip(min=0).sum(-1)
+        penalty: Float64 = (self.alpha * behind + self.beta * ahead) / (rewards.shape[1] - 1)
+        return rewards - penalty
 
 
 @dataclass(frozen=True, kw_only=True)
 class SocialValueOrientation(Value):
-    """Dislikes turns in which rewards are shared in another proportion than it likes.
+    """The reward of an agent that prefers a certain proportion between the others' rewards and its own.
 
     r'_i = r_i - weight x |angle - theta_i|, with theta_i = atan2(mean of the others' rewards, r_i), in
     radians. The difference is the shorter way around the circle, 0..pi. In a turn in which r_i and the mean
     of the others are both 0, no angle is defined, and r'_i = r_i = 0.
 
     Source: McKee et al., "Social Diversity and Social Preferences in Mixed-Motive Reinforcement Learning"
-    (2020), where rewards are never negative, so that the shorter way is the plain difference.
+    (2020). There rewards are never negative, so that the shorter way is the plain difference.
 
     Args:
-        angle: the proportion that it likes, in radians: 0 is for itself alone, pi / 4 for both
-            alike, pi / 2 for others alone, negative against others.
-        weight: reward lost per radian.
+        angle: the preferred proportion, in radians: 0 is all for itself, pi / 4 the same for itself and the
+            others, pi / 2 all for the others; a negative angle is against the others.
+        weight: the reward lost per radian of difference.
     """
 
     angle: Angle
     weight: Weight
 
-    def wanted(self, rewards: Float64) -> Float64:
-        of_others = _mean_of_others(rewards)
-        plain = abs(np.arctan2(of_others, rewards) - self.angle)
-        shorter = np.where(plain > pi, 2 * pi - plain, plain)
-        off = np.where((rewards == 0) & (of_others == 0), np.zeros_like(rewards), shorter)
-        return rewards - self.weight * off
+    def shaped(self, rewards: Float64) -> Float64:
+        """Return the shaped rewards of agents with these rewards, [B, N]."""
+        others_mean = _mean_of_others(rewards)
+        plain_difference = abs(np.arctan2(others_mean, rewards) - self.angle)
+        shorter_way = np.where(plain_difference > pi, 2 * pi - plain_difference, plain_difference)
+        has_no_angle = (rewards == 0) & (others_mean == 0)
+        difference = np.where(has_no_angle, np.zeros_like(rewards), shorter_way)
+        return rewards - self.weight * difference
 
 
 @dataclass(frozen=True)
 class Exchange(Value):
-    """Gives a share of its reward away, and gets one of each other's: r'_i = (1 - share) r_i + share x mean
-    of the others' rewards.
+    """The reward of an agent that exchanges a share of its reward with the others.
 
-    If all agents do, with the same share, the sum of their rewards stays.
+    r'_i = (1 - share) r_i + share x mean of the others' rewards. If all agents exchange the same share, the
+    sum of their rewards stays the same.
 
     Source: the reward transfers of Willis et al., "Resolving social dilemmas with minimal reward transfer"
     (2024), in which 1 - share is the self-interest level.
 
     Args:
-        share: 0 is the agent's own reward, 1 that of the others alone.
+        share: 0 keeps the agent's own reward, 1 replaces it by the mean of the others'.
     """
 
     share: Share
 
-    def wanted(self, rewards: Float64) -> Float64:
+    def shaped(self, rewards: Float64) -> Float64:
+        """Return the shaped rewards of agents with these rewards, [B, N]."""
         return (1 - self.share) * rewards + self.share * _mean_of_others(rewards)
 
 
 def _mean_of_others(rewards: Float64) -> Float64:
-    of_others: Float64 = (rewards.sum(-1)[:, None] - rewards) / (rewards.shape[1] - 1)
-    return of_others
+    """Return for each agent the mean of the others' rewards, [B, N]."""
+    return (rewards.sum(-1)[:, None] - rewards) / (rewards.shape[1] - 1)
 
 
 Reward: TypeAlias = Literal["individual", "team"] | InequityAversion | SocialValueOrientation | Exchange
-"""What an agent wants: "individual", its own reward; "team", the sum over all agents; or a comparison of its
-own with those of others."""
+"""The reward that an agent learns from: "individual", its own reward; "team", the sum of the rewards of all
+agents; or a value that compares its reward with the others'."""
 
 
 def check_reward(name: str, reward: Any, agents: int) -> None:
-    """Refuse what is no `Reward`, or none for a game of so few agents.
+    """Raise a ValueError unless a value is a `Reward` that a game of this many agents supports.
 
-    Raises:
-        ValueError: names what is given by `name`, e.g. "agents[0].reward".
+    Args:
+        name: names the value in messages, e.g. "agents[0].reward".
     """
     checked(name, reward, Reward)
     if agents < 2 and not isinstance(reward, str):
@@ -127,82 +137,88 @@ def check_reward(name: str, reward: Any, agents: int) -> None:
 
 
 def reward_name(reward: object) -> str:
-    """Return a reward as messages name it: "team" in quotes, a value by its class."""
+    """Return the name of a reward in messages, e.g. '"team"', with quotes, or 'Exchange'."""
     return f'"{reward}"' if isinstance(reward, str) else type(reward).__name__
 
 
 class RewardModel:
-    """Compute the rewards that agents want, turn by turn, and remember of the running episodes what that
-    needs.
+    """Computes the shaped rewards of agents turn by turn, with a memory of running episodes.
 
     Args:
-        reward: what all agents want.
+        reward: how the rewards of all agents are shaped.
     """
 
     def __init__(self, reward: Reward) -> None:
         checked("reward", reward, Reward)
         self.reward = reward
         self._smoothed: Float64 | None = None
-        """[B, N], the smoothed rewards after the latest turn, of an `InequityAversion`; None before the
-        first."""
-        self.now: Array | None = None
-        """[B, N], the wanted rewards of the latest turn; None before the first."""
+        """[B, N], the smoothed rewards after the latest turn, for `InequityAversion`; None before the first
+        turn."""
+        self.latest: _Array | None = None
+        """[B, N], the shaped rewards of the latest turn; None before the first turn."""
 
-    def add(self, rewards: Array, ended: Array) -> Array:
-        """Return the rewards wanted in the next turn of all worlds, a numpy array or a tensor as `rewards`.
+    def add(self, rewards: _Array, ended: _Array) -> _Array:
+        """Return the shaped rewards of the next turn of all worlds, a numpy array or a tensor as `rewards`.
 
         Args:
-            rewards: float [B, N], what the environment gives.
-            ended: bool [B], the worlds whose episode ends with this turn; they remember nothing of it.
+            rewards: float [B, N], the rewards of the environment.
+            ended: bool [B], marks the worlds whose episode ends with this turn: their smoothed rewards are
+                zero from the next turn on.
 
         Returns:
-            [B, N]: where all want their own those given, as they are; else float32, computed in float64.
+            [B, N]: the rewards as they are if they are "individual"; else float32, computed in float64.
         """
         if isinstance(rewards, Tensor):
-            wanted = self.add(rewards.numpy(force=True), ended.numpy(force=True))
-            self.now = torch.as_tensor(wanted, device=rewards.device)
-            return self.now
+            shaped = self.add(rewards.numpy(force=True), ended.numpy(force=True))
+            self.latest = torch.as_tensor(shaped, device=rewards.device)
+            return self.latest
         if rewards.shape[1] < 2:
             check_reward("reward", self.reward, rewards.shape[1])
-        with np.errstate(all="ignore"):  # rewards that are not finite are found and named elsewhere
-            self.now = self._wanted(rewards, ended)
-        return self.now
+        with np.errstate(all="ignore"):  # `cprl.training.nan_check` reports rewards that are not finite
+            self.latest = self._shaped(rewards, ended)
+        return self.latest
 
-    def _wanted(self, rewards: Array, ended: Array) -> Array:
+    def _shaped(self, rewards: _Array, ended: _Array) -> _Array:
+        """Return the shaped rewards of a turn as a numpy array; update the smoothed rewards."""
         if self.reward == "individual":
             return rewards
         if self.reward == "team":
             return np.ones_like(rewards) * rewards.sum(-1)[:, None]
         assert not isinstance(self.reward, str)
-        given = rewards.astype(np.float64)
+        raw = rewards.astype(np.float64)
         if not isinstance(self.reward, InequityAversion):
-            return self.reward.wanted(given).astype(np.float32)
-        smoothed = given.copy()
+            return self.reward.shaped(raw).astype(np.float32)
+        smoothed = raw.copy()
         if self._smoothed is not None:
             if self._smoothed.shape != rewards.shape:
                 raise ValueError(
                     f"rewards is {list(rewards.shape)}; allowed: {list(self._smoothed.shape)}, as in the "
                     "turn before, or clear() before"
                 )
-            smoothed = self.reward.smoothing * self._smoothed + given
-        wanted = self.reward.wanted(given, smoothed).astype(np.float32)
+            smoothed = self.reward.smoothing * self._smoothed + raw
+        shaped = self.reward.shaped(raw, smoothed).astype(np.float32)
         smoothed[ended] = 0
         self._smoothed = smoothed
-        return wanted
+        return shaped
 
     def clear(self) -> None:
         """Forget the running episodes of all worlds."""
-        self._smoothed = self.now = None
+        self._smoothed = self.latest = None
 
     def state_dict(self) -> dict[str, Tensor]:
-        """What is remembered: "smoothed" float64 [B, N]; empty if nothing is."""
+        """Return the memory of running episodes: "smoothed", float64 [B, N]; empty if there is none."""
         return {} if self._smoothed is None else {"smoothed": torch.from_numpy(self._smoothed)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        """Continue from a state that `state_dict` returned.
+
+        Raises:
+            ValueError: if the state is not [B, N], or the reward has no memory.
+        """
         smoothed = state.get("smoothed")
-        remembers = isinstance(self.reward, InequityAversion)
-        if smoothed is not None and (smoothed.ndim != 2 or not remembers):
-            allowed = "[worlds, agents]" if remembers else "none, since this reward remembers nothing"
+        has_memory = isinstance(self.reward, InequityAversion)
+        if smoothed is not None and (smoothed.ndim != 2 or not has_memory):
+            allowed = "[worlds, agents]" if has_memory else "none, since this reward remembers nothing"
             raise ValueError(f'"smoothed" of the state is {list(smoothed.shape)}; allowed: {allowed}')
         self.clear()
         if smoothed is not None:

@@ -1,5 +1,5 @@
-"""Losses by one step of temporal differences: ln cosh of the error, which neither torch nor TorchRL has, and
-what losses of our own share whose targets bootstrap so."""
+"""Losses of temporal-difference errors: the log-cosh loss, which neither torch nor TorchRL has, and `TDLoss`,
+the base of cprl's own losses with one-step targets."""
 
 from dataclasses import dataclass
 from math import log
@@ -13,40 +13,44 @@ from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss, LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
-from cprl.system.compat import ReshapedLoss
+from cprl.system.compat.torchrl import ReshapedLoss
 
 LOG_COSH: Final = "log_cosh"
-"""Its name among loss functions."""
+"""The name of the log-cosh loss among loss functions."""
 TORCHRL_DISTANCES: Final = ("l1", "l2", "smooth_l1")
 """The loss functions that TorchRL has."""
 DISTANCES: Final = (*TORCHRL_DISTANCES, LOG_COSH)
-"""The loss functions of `distance`."""
+"""The loss functions of `td_distance`."""
 
 
 def log_cosh(error: Tensor) -> Tensor:
-    """ln cosh of each error d, a tensor of any shape: about d^2 / 2 near 0 and abs(d) - ln 2 far from it.
+    """Return ln cosh d for each error d of a tensor: about d^2 / 2 near 0, and abs(d) - ln 2 far from 0.
 
-    Computed as d + softplus(-2 d) - ln 2, which does not overflow. Its derivative is tanh(d). In float32 both
-    have a rounding error of about 1e-7, so the loss of an error below 1e-3 is hardly more than noise, its
-    derivative is not.
+    It is computed as d + softplus(-2 d) - ln 2, which does not overflow; its derivative is tanh(d). In
+    float32 both have a rounding error of about 1e-7. So for errors below 1e-3 the loss is mostly rounding
+    error, but the derivative is still exact enough to learn from.
 
     Source: the loss "logcosh" of Keras 2.2.4 (`keras/losses.py`).
     """
     return error + softplus(-2.0 * error) - log(2)
 
 
-def distance(value: Tensor, target: Tensor, name: str) -> Tensor:
-    """TorchRL's `distance_loss`, which reduces nothing, for each name in `DISTANCES`."""
+def td_distance(value: Tensor, target: Tensor, name: str) -> Tensor:
+    """Return the loss of each value, in the shape of `value`, by a loss function.
+
+    Args:
+        name: a name in `DISTANCES`.
+    """
     if name == LOG_COSH:
         return log_cosh(value - target)
-    one: Tensor = distance_loss(value, target, name)
-    return one
+    return distance_loss(value, target, name)
 
 
 class LogCoshDQNLoss(ReshapedLoss, DQNLoss):
     """TorchRL's `DQNLoss` with the log-cosh of the temporal-difference errors.
 
-    log-cosh is even: it is that of the absolute error, which `DQNLoss` computes for `loss_function="l1"`.
+    With `loss_function="l1"` `DQNLoss` computes absolute errors; their log-cosh is that of the errors
+    themselves, since it is an even function. The arguments are those of `DQNLoss`.
     """
 
     def __init__(
@@ -68,15 +72,16 @@ class LogCoshDQNLoss(ReshapedLoss, DQNLoss):
         )
 
     def reshape_each(self, losses: Tensor) -> Tensor:
+        """Return the log-cosh of absolute errors."""
         return log_cosh(losses)
 
 
 class TDLoss(LossModule):
-    """A loss with TorchRL's TD(0) estimator, over the entries that `tensor_keys` names."""
+    """The base of losses whose targets are r + gamma times the next value, by TorchRL's TD(0) estimator."""
 
     @dataclass
     class _AcceptedKeys:
-        """The entries by the names that `set_keys` takes."""
+        """The entries that the loss reads, by the names under which `set_keys` renames them."""
 
         action: NestedKey = "action"
         reward: NestedKey = "reward"
@@ -95,10 +100,10 @@ class TDLoss(LossModule):
             self._value_estimator.set_keys(**self._estimator_keys())
 
     def make_value_estimator(self, value_type: Any = None, **hyperparams: Any) -> Self:
-        """Sets the discount, e.g. `make_value_estimator(ValueEstimators.TD0, gamma=0.99)`."""
+        """Set the discount, e.g. `make_value_estimator(ValueEstimators.TD0, gamma=0.99)`."""
         dispatch_value_estimator(
             self,
-            self.default_value_estimator if value_type is None else value_type,
+            value_type or self.default_value_estimator,
             supported=(ValueEstimators.TD0,),
             tensor_keys=self._estimator_keys(),
             value_network=None,
@@ -109,13 +114,16 @@ class TDLoss(LossModule):
     def outputs_of(
         self, name: str, weights: TensorDictBase, tensordict: TensorDictBase, **entries: Tensor
     ) -> Tensor:
-        """The first output of a network of this name with these weights.
+        """Return the first output of a network of the loss, computed with given weights.
 
         Args:
-            tensordict: has the entries that the network reads, but for those given.
+            name: the attribute that holds the network.
+            weights: the weights, e.g. those of the target.
+            tensordict: has the entries that the network reads, except `entries`.
+            entries: further entries that the network reads.
         """
         network = getattr(self, name)
-        seen = tensordict.select(*(key for key in network.in_keys if key not in entries)).update(entries)
+        inputs = tensordict.select(*(key for key in network.in_keys if key not in entries)).update(entries)
         with weights.to_module(network, preserve_module_state=False):
-            output: Tensor = network(seen).get(network.out_keys[0])
+            output: Tensor = network(inputs).get(network.out_keys[0])
         return output

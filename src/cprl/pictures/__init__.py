@@ -1,10 +1,10 @@
-"""Games for people: boards as images, rules in words, the colours of all pictures. The game needs none of it.
+"""Games for people: boards as images, and rules in words. The game itself needs none of it.
 
-In reading order:
+Modules in reading order:
 
     colours   the palette of all pictures for people
-    image     a board as pixels, in which agents have number, heading and second mark
-    svg       the board of a map as SVG
-    readable  a game's rules and institutions in words
-    decoding  observations back to classes of cells, for viewers and for policies that read them
+    image     draws a board as pixels; agents have a number, a heading and a mark
+    svg       draws the board of a map as SVG
+    readable  says a game's rules and institutions in words
+    decoding  turns observations back into classes of cells, for viewers and for scripted policies
 """

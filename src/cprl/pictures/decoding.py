@@ -1,27 +1,34 @@
-"""Observations back to classes of cells, whatever form the game gives them."""
+"""Decode observations, in all forms that games have, into classes of cells."""
 
 from typing import Final
 
 import numpy as np
 
 from cprl.commons.game import Game
-from cprl.values.arrays import UInt8
+from cprl.values.array_types import UInt8
 
 UNSEEN: Final = 255
-"""The class of a colour that the game does not use, and of a pixel that lies in no window."""
+"""The class of an unknown cell: its colour is none of the game, or it lies outside all windows."""
 
 
 def classes_seen(game: Game, windows: UInt8) -> UInt8:
-    """Return the class of each cell (`cprl.commons.cells`), uint8 [T, N, X, Y], of a game's observations,
-    uint8 [T, N, C, X, Y]; UNSEEN for a colour that the game does not use.
+    """Return the classes of the cells that agents observed, see `cprl.commons.cells`.
+
+    Args:
+        game: the game that the agents play.
+        windows: observations of T turns, uint8 [T, N, C, X, Y].
+
+    Returns:
+        uint8 [T, N, X, Y]; UNSEEN for colours that the game does not use.
     """
     windows = windows[:, :, : len(game.cell_channels)]
     if game.observation.encoding == "one_hot":
         classes: UInt8 = np.take(np.array(game.cell_classes, np.uint8), windows.argmax(2))
         return classes
-    packed = windows.astype(np.uint32)
-    keys = packed[:, :, 0] | packed[:, :, 1] << 8 | packed[:, :, 2] << 16
-    classes = np.full(keys.shape, UNSEEN, np.uint8)
-    for kind, (red, green, blue) in enumerate(game.palette.astype(np.uint32)):
-        classes[keys == (red | green << 8 | blue << 16)] = kind
+    # A colour as one number can be compared at once with the colour of each class.
+    channels = windows.astype(np.uint32)
+    colours = channels[:, :, 0] | channels[:, :, 1] << 8 | channels[:, :, 2] << 16
+    classes = np.full(colours.shape, UNSEEN, np.uint8)
+    for cell_class, (red, green, blue) in enumerate(game.palette.astype(np.uint32)):
+        classes[colours == (red | green << 8 | blue << 16)] = cell_class
     return classes

@@ -1,7 +1,7 @@
-"""An image of the board for people: apples, walls, and agents in their hues with number, heading and mark.
+"""Draw the board for people: apples, walls, and agents in their hues with number, heading and mark.
 
-Digits are paths on a grid of three by five points, so that a picture can fill them as pixels and the viewer
-can draw them as lines, neither with a font.
+The digits of the numbers are paths on a grid of three by five points. So an image can fill them as pixels and
+the viewer can draw them as lines, both without a font.
 """
 
 from functools import cache
@@ -13,21 +13,24 @@ from numpy.typing import NDArray
 
 from cprl.commons.cells import APPLE, BEAM, CLEANING, GROUND, WALL, WASTE, WATER, Colour
 from cprl.commons.maps import Cell, Map
-from cprl.commons.world import Shown
+from cprl.commons.world import WorldView
 from cprl.pictures.colours import PALETTE, agent_colour, agent_mark
 from cprl.values import Range, checked
-from cprl.values.arrays import Bool, Float32, UInt8
+from cprl.values.array_types import Bool, Float32, UInt8
 
 LARGEST_CELL_PIXELS: Final = 1000
 GRID_COLOUR: Final = (28, 30, 36)
 EMPTY_SITE_COLOUR: Final = (40, 43, 51)
-"""The colour of a site without an apple: dim, so that a field picked bare still looks like a field."""
+"""The colour of a site without an apple; dim, so that one still sees where apples could grow."""
 
 
-def world_image(board: Map, world: Shown, *, cell_pixels: int = 24) -> UInt8:
-    """Return an image of one world without the agents out of play, uint8 [rows, columns, 3] in RGB.
+def world_image(board: Map, world: WorldView, *, cell_pixels: int = 24) -> UInt8:
+    """Return an image of one world in RGB, uint8 [rows, columns, 3], without the agents out of play.
 
-    A cell is `cell_pixels` high and wide, 8..1000, a line between two cells one of these.
+    Args:
+        board: the map of the world.
+        world: the state of the world, see `Batch.show`.
+        cell_pixels: the width and height of a cell in pixels, 8..1000, of which one is a line between cells.
     """
     size = checked("cell_pixels", cell_pixels, Annotated[int, Range(8, LARGEST_CELL_PIXELS)])
     shape = (board.height * size + 1, board.width * size + 1, 3)
@@ -54,7 +57,7 @@ def world_image(board: Map, world: Shown, *, cell_pixels: int = 24) -> UInt8:
 
 
 def _inside(image: UInt8, cell: Cell, size: int, *, inset: int = 0) -> UInt8:
-    """Return the pixels of a cell between its lines, without so many on each side."""
+    """Return a view of the pixels of a cell between its lines, less `inset` pixels on each side."""
     row, col = cell
     rows = slice(row * size + 1 + inset, (row + 1) * size - inset)
     columns = slice(col * size + 1 + inset, (col + 1) * size - inset)
@@ -62,15 +65,16 @@ def _inside(image: UInt8, cell: Cell, size: int, *, inset: int = 0) -> UInt8:
 
 
 NOTHING, BODY, INK, MARKED = range(4)
-"""The parts of a sprite: around the agent, its hue, the number and triangle, the second mark."""
+"""The values of a sprite's pixels: around the agent, in its hue, of number and triangle, of the mark."""
 
 INK_COLOUR: Final[Colour] = (16, 18, 22)
 MARK_COLOUR: Final[Colour] = (255, 255, 255)
 
 DIGIT_HIGH: Final = 5
-_DIGIT_APART: Final = 4
-"""The points from a digit's first column to that of the next one: three of its own and a gap."""
-_PATHS: Final = (
+"""The height of a digit in points."""
+_DIGIT_STRIDE: Final = 4
+"""The points from the first column of a digit to that of the next one: a digit's three columns and a gap."""
+_DIGIT_PATHS: Final = (
     "13971",
     "12879",
     "136479",
@@ -82,23 +86,25 @@ _PATHS: Final = (
     "4139746",
     "641397",
 )
-"""The path of each digit over the keys 1 to 9 of a telephone, upright or level from key to key; columns
-are one point apart, rows two."""
-POINTS: Final = max(map(len, _PATHS))
-"""The corners of the longest path."""
+"""The path of each digit, 0 first, as the keys of a telephone that it passes: 1 2 3 in the top row, 7 8 9 in
+the bottom row. Columns of keys are one point apart, rows two points. Each step is upright or level."""
+POINTS: Final = max(map(len, _DIGIT_PATHS))
+"""The number of corners of the longest path."""
 
 
 def number_paths(number: int) -> list[Float32]:
-    """Return the path of each digit of a number around (0, 0): float32 [corners, 2], column and row of each
-    corner, in points of the grid."""
-    pixels_wide = _DIGIT_APART * len(str(number)) - 1
-    middle = np.array([(pixels_wide - 1) / 2, (DIGIT_HIGH - 1) / 2], np.float32)
+    """Return the paths of the digits of a number, so that the number is centred at (0, 0).
+
+    Each path is float32 [corners, 2]: column and row of each corner, in points of the grid.
+    """
+    width = _DIGIT_STRIDE * len(str(number)) - 1
+    middle = np.array([(width - 1) / 2, (DIGIT_HIGH - 1) / 2], np.float32)
     return [path.astype(np.float32) - middle for path in _paths(number)]
 
 
 def number_pixels(number: int) -> Bool:
-    """Return a number as pixels: bool [5, 4 * digits - 1]."""
-    pixels = np.zeros((DIGIT_HIGH, _DIGIT_APART * len(str(number)) - 1), np.bool_)
+    """Return the pixels that draw a number: bool [5, 4 * digits - 1]."""
+    pixels = np.zeros((DIGIT_HIGH, _DIGIT_STRIDE * len(str(number)) - 1), np.bool_)
     for path in _paths(number):
         for line in pairwise(path):
             (left, top), (right, bottom) = np.sort(line, axis=0)
@@ -107,11 +113,11 @@ def number_pixels(number: int) -> Bool:
 
 
 def _paths(number: int) -> list[NDArray[np.intp]]:
-    """Return the path of each digit of a number, [corners, 2], column and row, the first from column 0 on."""
+    """Return the paths of the digits of a number, [corners, 2] each: column and row, both from 0 on."""
     paths = []
-    for place, digit in enumerate(str(number)):
-        keys = np.array([int(key) - 1 for key in _PATHS[int(digit)]])
-        columns = keys % 3 + place * _DIGIT_APART
+    for position, digit in enumerate(str(number)):
+        keys = np.array([int(key) - 1 for key in _DIGIT_PATHS[int(digit)]])
+        columns = keys % 3 + position * _DIGIT_STRIDE
         rows = keys // 3 * 2
         paths.append(np.stack([columns, rows], axis=1))
     return paths
@@ -119,55 +125,64 @@ def _paths(number: int) -> list[NDArray[np.intp]]:
 
 @cache
 def agent_sprite(agent: int, heading: int, size: int) -> UInt8:
-    """Return an agent in a cell: uint8 [size, size], `NOTHING`, `BODY`, `INK` or `MARKED`.
+    """Return the picture of an agent in a cell: uint8 [size, size], `NOTHING`, `BODY`, `INK` or `MARKED`.
 
-    A number too large for the cell is left out; from eleven pixels on, numbers below 100 fit.
+    A number that is too large for the cell is left out; numbers below 100 fit from eleven pixels on.
     """
     mark = agent_mark(agent)
     edge = 1 if size > 14 else 0
-    body = size - 2 * edge
-    mark_wide = max(1, body // 10)
-    rim = mark_wide if mark == "ring" else 0
-    tip = rim + edge
-    deep = max(1, body // 5)
-    sprite = np.full((body, body), BODY, np.uint8)
-    _draw_mark(sprite, mark, mark_wide)
-    for row in range(deep):
-        sprite[tip + row, body // 2 - row : (body + 1) // 2 + row] = INK
-    sprite = np.rot90(sprite, -heading).copy()
-    back = mark_wide if mark in ("ring", "stripe") else edge
-    _draw_number(sprite, agent, heading, front=tip + deep, back=back, side=rim)
-    whole = np.pad(sprite, edge, constant_values=NOTHING)
-    whole.flags.writeable = False
-    return whole
+    body_size = size - 2 * edge
+    mark_width = max(1, body_size // 10)
+    ring_width = mark_width if mark == "ring" else 0
+    triangle_top = ring_width + edge
+    triangle_height = max(1, body_size // 5)
+    body = np.full((body_size, body_size), BODY, np.uint8)
+    _draw_mark(body, mark, mark_width)
+    for row in range(triangle_height):
+        body[triangle_top + row, body_size // 2 - row : (body_size + 1) // 2 + row] = INK
+    body = np.rot90(body, -heading).copy()
+    front = triangle_top + triangle_height
+    back = mark_width if mark in ("ring", "stripe") else edge
+    _draw_number(body, agent, heading, front=front, back=back, side=ring_width)
+    sprite = np.pad(body, edge, constant_values=NOTHING)
+    sprite.flags.writeable = False  # the cache gives the same array to all callers
+    return sprite
 
 
-def _draw_mark(sprite: UInt8, mark: str, wide: int) -> None:
-    """Draw the mark of an agent that is headed up."""
+def _draw_mark(body: UInt8, mark: str, width: int) -> None:
+    """Draw the mark of an agent that heads up."""
     if mark == "ring":
-        sprite[:] = MARKED
-        sprite[wide:-wide, wide:-wide] = BODY
+        body[:] = MARKED
+        body[width:-width, width:-width] = BODY
     elif mark == "stripe":
-        sprite[-wide:] = MARKED
+        body[-width:] = MARKED
     elif mark == "corners":
-        for rows in (slice(2 * wide), slice(-2 * wide, None)):
-            sprite[rows, : 2 * wide] = MARKED
-            sprite[rows, -2 * wide :] = MARKED
+        for rows in (slice(2 * width), slice(-2 * width, None)):
+            body[rows, : 2 * width] = MARKED
+            body[rows, -2 * width :] = MARKED
 
 
-def _draw_number(sprite: UInt8, agent: int, heading: int, *, front: int, back: int, side: int) -> None:
-    """Draw the number as large as it fits behind the triangle, whatever the heading."""
+_BACKWARD_STEPS: Final = ((1, 0), (0, -1), (-1, 0), (0, 1))
+"""The step (row, column) to the back of an agent, by heading."""
+
+
+def _draw_number(body: UInt8, agent: int, heading: int, *, front: int, back: int, side: int) -> None:
+    """Draw the number behind the triangle, as large as possible and upright for every heading.
+
+    `front`, `back`, `side`: the pixels that are taken at the front, at the back and at each side.
+    """
     pixels = number_pixels(agent)
-    body = len(sprite)
-    deep = body - front - back
-    broad = body - 2 * side
-    scale = min(deep - (len(pixels) == max(pixels.shape)), broad) // max(pixels.shape)
+    body_size = len(body)
+    free_length = body_size - front - back
+    free_width = body_size - 2 * side
+    is_upright_digit = len(pixels) == max(pixels.shape)
+    scale = min(free_length - is_upright_digit, free_width) // max(pixels.shape)
     if scale < 1:
         return
     pixels = pixels.repeat(scale, 0).repeat(scale, 1)
-    high, wide = pixels.shape
-    behind = (front + 1 - back) // 2
-    down, right = ((1, 0), (0, -1), (-1, 0), (0, 1))[heading]
-    top = min(max((body - high) // 2 + behind * down, 0), body - high)
-    left = min(max((body - wide) // 2 + behind * right, 0), body - wide)
-    sprite[top : top + high, left : left + wide][pixels] = INK
+    height, width = pixels.shape
+    shift = (front + 1 - back) // 2
+    down, right = _BACKWARD_STEPS[heading]
+    top = min(max((body_size - height) // 2 + shift * down, 0), body_size - height)
+    left = min(max((body_size - width) // 2 + shift * right, 0), body_size - width)
+    body[top : top + height, left : left + width][pixels] = INK

@@ -1,6 +1,6 @@
-"""A game for readers: its rules and institutions in words, beside its board.
+"""Say a game's rules and institutions in words, for people who do not know the settings.
 
-What these sentences say holds in the game that they are about; `tests/test_readable.py` plays it.
+`tests/pictures/test_readable.py` plays games to check that the sentences are true of them.
 """
 
 import re
@@ -28,22 +28,26 @@ from cprl.institutions import (
     Tax,
     Vote,
 )
-from cprl.institutions.base import Kind
+from cprl.institutions.institution import Kind
 from cprl.institutions.monitoring import ELECTED
 from cprl.pictures.svg import board_svg
 
 
-def game_html(game: Game, own_rules: str = "") -> str:
-    """Return a game's board and rules in words, as HTML; `own_rules`: rules of the user's own, in words."""
-    rules = "; ".join(filter(None, (rules_of(game), own_rules))) or NO_RULES
+def game_html(game: Game, custom_rules: str = "") -> str:
+    """Return a game as HTML: its rules in words, and its board.
+
+    `custom_rules`: further rules in words, e.g. those of the user's own transforms.
+    """
+    rules = "; ".join(filter(None, (rules_of(game), custom_rules))) or NO_RULES
     return f"<p>{escape(growth_of(game))} Rules: {escape(rules)}.</p>{board_svg(game.map)}"
 
 
 NO_RULES: Final = "none beyond the game"
+"""The text in place of institutions for a game without any."""
 
 
 def growth_of(game: Game) -> str:
-    """Say how apples grow back, for readers who see the game for the first time."""
+    """Return sentences that say how apples grow back, for readers who are new to the game."""
     rules = game.rules
     river = rules.river
     probs = rules.regrow_prob
@@ -65,15 +69,20 @@ def growth_of(game: Game) -> str:
 
 
 def rules_of(game: Game | None) -> str:
-    """Name the institutions of a game, each with its first number and all that are not the defaults, e.g.
-    "quota (share 0.25, fine 2), monitoring (prob 0.5)"."""
+    """Return the names and settings of a game's institutions in one line, "" without any.
+
+    Example: "quota (share 0.25, fine 2), monitoring (prob 0.5)".
+    """
     return ", ".join(rule_of(institution) for institution in (game.institutions if game else ()))
 
 
 def rule_of(institution: Institution, *, is_voted_on: bool = False) -> str:
-    """Name an institution with its first number and all that are not the defaults; without a rate or share
-    that is not used, since it is voted on or there are brackets."""
-    words = in_lower_case(type(institution).__name__)
+    """Return the name of an institution with its main settings, e.g. "quota (share 0.25, fine 2)".
+
+    These are its first number and all numbers that differ from their defaults. A rate or share is left out if
+    it is not used, because agents vote on it or because a tax has brackets.
+    """
+    text = in_lower_case(type(institution).__name__)
     has_brackets = isinstance(institution, Tax) and len(institution.brackets) > 0
     unused = {"rate", "share"} if is_voted_on or has_brackets else set[str]()
     settings: list[str] = []
@@ -84,23 +93,26 @@ def rule_of(institution: Institution, *, is_voted_on: bool = False) -> str:
             settings.append(f"on {rule_of(value, is_voted_on=True)}")
         elif numbers and field.name not in unused and (value != field.default or not (settings or unused)):
             settings.append(f"{field.name.replace('_', ' ')} {' '.join(map(_number, numbers))}")
-    return f"{words} ({', '.join(settings)})" if settings else words
+    return f"{text} ({', '.join(settings)})" if settings else text
 
 
 def _numbers(value: object) -> list[float]:
     """Return the numbers that a field holds: those of a tuple, or the value itself if it is one."""
     values = value if isinstance(value, tuple) else (value,)
-    return [each for each in values if isinstance(each, int | float) and not isinstance(each, bool)]
+    return [item for item in values if isinstance(item, int | float) and not isinstance(item, bool)]
 
 
 def in_lower_case(name: str) -> str:
-    """Return the name of a class in words, e.g. "closed season"."""
+    """Return the name of a class in words: "closed season" for "ClosedSeason"."""
     return re.sub("(?<=[a-z])(?=[A-Z])", " ", name).lower()
 
 
 def tag_of(game: Game) -> str:
-    """Say what it takes to tag an agent in this game and what that does to it, e.g. "after 2 hits an agent
-    leaves the board for 24 turns"; "" where nobody can be tagged, or nothing follows."""
+    """Return a clause that says how agents are tagged in a game and what happens to them then.
+
+    Example: "after 2 hits an agent leaves the board for 24 turns". The clause is "" if nobody can be tagged,
+    or if a tag has no effect.
+    """
     rules = game.rules
     if not rules.may_fire or game.agents == 1:
         return ""
@@ -113,37 +125,41 @@ def tag_of(game: Game) -> str:
     if sanctions is not None and any(sanctions.fines):
         effects.append(f"pays {_by_level(sanctions.fines, 'apple')}")
     if any(missed):
-        place = "" if rules.clashes == "pairwise" else ", longer while its cell is taken"
-        place = " and returns at a free spawn place" if rules.respawn_at_spawns else place
-        effects.append(f"leaves the board for {_missed(missed, sanctions)}{place}")
+        returning = "" if rules.clashes == "pairwise" else ", longer while its cell is taken"
+        if rules.respawn_at_spawns:
+            returning = " and returns at a free spawn place"
+        effects.append(f"leaves the board for {_missed(missed, sanctions)}{returning}")
     elif rules.respawn_at_spawns:
         effects.append("goes to a free spawn place")
-    who = "an agent that is hit" if rules.hits_to_tag == 1 else f"after {rules.hits_to_tag} hits an agent"
-    return f"{who} {' and '.join(effects)}" if effects else ""
+    subject = "an agent that is hit" if rules.hits_to_tag == 1 else f"after {rules.hits_to_tag} hits an agent"
+    return f"{subject} {' and '.join(effects)}" if effects else ""
 
 
 def _turns_missed(game: Game, sanctions: GraduatedSanctions | None) -> tuple[int, ...]:
-    """Return the turns that an agent misses after a tag, or after any other offence, by the level of
-    sanctions, and by who tags it where sanctions have a table."""
-    steps = np.ravel(game.rules.freeze_steps if sanctions is None else sanctions.freeze_steps).tolist()
+    """Return the turns that an agent misses after a tag or another offence, by the level of sanctions.
+
+    If the sanctions have a table, its rows for the agents that tag follow one another.
+    """
+    freeze_steps = game.rules.freeze_steps if sanctions is None else sanctions.freeze_steps
     quirks = game.rules.quirks
     counts_tag_turn = quirks is not None and quirks.freeze_counts_tag_turn
-    return tuple(max(0, each - counts_tag_turn) for each in steps)
+    return tuple(max(0, steps - counts_tag_turn) for steps in np.ravel(freeze_steps).tolist())
 
 
 def _sanctions_of_tags(game: Game) -> GraduatedSanctions | None:
-    """Return the sanctions of a game that take the place of `Rules.freeze_steps`."""
+    """Return the sanctions that replace `Rules.freeze_steps` in a game; None without any."""
     sanctions = _first(game, GraduatedSanctions)
     return None if sanctions is None or sanctions.on == "violations" else sanctions
 
 
 def _first(game: Game, kind: type[Kind]) -> Kind | None:
-    """Return the institution of a kind of which a game has one at most."""
-    return next((each for each in game.institutions if isinstance(each, kind)), None)
+    """Return the first institution of a kind in a game, None without one."""
+    return next((institution for institution in game.institutions if isinstance(institution, kind)), None)
 
 
 def meaning_of(institution: Institution, game: Game) -> str:
-    """Say what an institution does in this game, in sentences for readers who do not know its settings."""
+    """Return sentences that say what an institution does in a game, for readers who do not know its
+    settings."""
     match institution:
         case Boundaries():
             return _boundaries(institution, game)
@@ -151,51 +167,49 @@ def meaning_of(institution: Institution, game: Game) -> str:
             apples = institution.share * _quota_unit(institution, game)
             return _quota(institution, game, _apples(int(apples + 1e-9)))
         case ClosedSeason(period_steps=period, closed_steps=closed):
-            words = f"Nobody {_may(institution.fine)} pick in the last {closed:,} of every {_turns(period)}."
-            return words + _breach(institution.fine, game)
+            text = f"Nobody {_may(institution.fine)} pick in the last {closed:,} of every {_turns(period)}."
+            return text + _breach(institution.fine, game)
         case ClosedPatches(below=below):
             few = f"has fewer than {_apples(below)} when a turn begins"
-            words = f"Nobody {_may(institution.fine)} pick from a patch of near places that {few}."
-            return words + _breach(institution.fine, game)
+            text = f"Nobody {_may(institution.fine)} pick from a patch of near places that {few}."
+            return text + _breach(institution.fine, game)
         case Rotation(window_steps=window):
-            words = (
-                f"Only one agent {_may(institution.fine)} pick; every {_turns(window)} it is the next one."
-            )
-            return words + _breach(institution.fine, game)
+            text = f"Only one agent {_may(institution.fine)} pick; every {_turns(window)} it is the next one."
+            return text + _breach(institution.fine, game)
         case Vote():
             return _vote(institution, game)
         case Tax():
             return _tax(institution)
         case Levies(groups=groups, local_rate=local, joint_rate=joint):
-            who = "; ".join(_agents(group) for group in groups)
-            words = f"{_percent(local)} of what each agent picks is shared equally within its group ({who}), "
-            return words + f"and {_percent(joint)} among all."
+            agents = "; ".join(_agents(group) for group in groups)
+            text = f"{_percent(local)} of what each agent picks is shared equally within its group ({agents})"
+            return f"{text}, and {_percent(joint)} among all."
         case Monitoring(prob=prob, cost=cost):
-            words = f"Of the turns in which an agent breaks a rule, {_percent(prob)} are noticed."
-            return words + f" That costs {_apples(cost)} a turn, paid by {_payer(institution)}." * (cost > 0)
+            text = f"Of the turns in which an agent breaks a rule, {_percent(prob)} are noticed."
+            return text + f" That costs {_apples(cost)} a turn, paid by {_payer(institution)}." * (cost > 0)
         case GraduatedSanctions():
             return _graduated_sanctions(institution, game)
         case Mediation(turns=turns, refund=refund):
-            words = f"An agent that is tagged and broke no rule in the last {_turns(turns)}"
-            return words + f" gets {_apples(refund)} from who tagged it."
+            text = f"An agent that is tagged and broke no rule in the last {_turns(turns)}"
+            return text + f" gets {_apples(refund)} from who tagged it."
         case Punishment(fine=fine, cost=cost, shot_cost=shot_cost):
             hits = game.rules.hits_to_tag
             tag = "A hit" if hits == 1 else f"A tag, which takes {hits} hits,"
-            words = f"{tag} costs the agent that is hit {_apples(fine)} and the shooter {_number(cost)}."
-            return words + f" Each shot costs {_number(shot_cost)}." * (shot_cost > 0)
+            text = f"{tag} costs the agent that is hit {_apples(fine)} and the shooter {_number(cost)}."
+            return text + f" Each shot costs {_number(shot_cost)}." * (shot_cost > 0)
         case Sanctioner():
             return _sanctioner(institution)
     raise TypeError(f"{type(institution).__name__} has no sentence in cprl.pictures.readable")
 
 
 def _boundaries(boundaries: Boundaries, game: Game) -> str:
-    bite = boundaries.bite_fine
-    step = boundaries.step_fine
-    may_not = "cannot" if bite is None else "may not"
-    words = f"The board has regions with owners; others {may_not} pick there.{_breach(bite, game)}"
-    if step is None:
-        return words
-    return f"{words} A turn that ends in another's region {_costs(step, game)}."
+    fine = boundaries.bite_fine
+    step_fine = boundaries.step_fine
+    may_not = "cannot" if fine is None else "may not"
+    text = f"The board has regions with owners; others {may_not} pick there.{_breach(fine, game)}"
+    if step_fine is None:
+        return text
+    return f"{text} A turn that ends in another's region {_costs(step_fine, game)}."
 
 
 def _quota_unit(quota: Quota, game: Game) -> float:
@@ -204,37 +218,37 @@ def _quota_unit(quota: Quota, game: Game) -> float:
 
 
 def _quota(quota: Quota, game: Game, most: str) -> str:
-    """Say what a quota of at most so much means."""
+    """Return sentences about a quota; `most`: the largest harvest in a window, in words."""
     fewer = ", fewer if the board is not full when it begins" if quota.by_stock else ""
-    words = f"Each agent may pick at most {most} in each window of {_turns(quota.window_steps)}{fewer}."
-    return words + (" More cannot be picked." if quota.is_stopped else _breach(quota.fine, game))
+    text = f"Each agent may pick at most {most} in each window of {_turns(quota.window_steps)}{fewer}."
+    return text + (" More cannot be picked." if quota.is_stopped else _breach(quota.fine, game))
 
 
 def _tax(tax: Tax, rate: str = "") -> str:
-    """Say what a tax means; `rate`: what is said of it where it is voted on."""
-    goes = "shared equally among all" if tax.redistribution == "equal" else "lost"
+    """Return a sentence about a tax; `rate`: the rate in words, if agents vote on it."""
+    use = "shared equally among all" if tax.redistribution == "equal" else "lost"
     if not tax.brackets:
-        return f"{rate or _percent(tax.rate)} of what each agent picks is taken and {goes}."
+        return f"{rate or _percent(tax.rate)} of what each agent picks is taken and {use}."
     brackets = ", ".join(f"{_percent(share)} from {_number(apples)} on" for apples, share in tax.brackets)
-    words = f"Of the apples that an agent picks in {_turns(tax.period_steps)} a part is taken and {goes}"
-    return f"{words}: {brackets}."
+    text = f"Of the apples that an agent picks in {_turns(tax.period_steps)} a part is taken and {use}"
+    return f"{text}: {brackets}."
 
 
 def _vote(vote: Vote, game: Game) -> str:
     choices = ", ".join(map(_number, vote.choices))
-    words = f"Agents vote on {vote.on.voted_on}, {choices}, {_every(vote.period_episodes)}: the median counts"
-    words += _override(vote.override_prob)
+    text = f"Agents vote on {vote.on.voted_on}, {choices}, {_every(vote.period_episodes)}: the median counts"
+    text += _override(vote.override_prob)
     if isinstance(vote.on, Tax):
-        return f"{words}. {_tax(vote.on, 'That share')}"
+        return f"{text}. {_tax(vote.on, 'That share')}"
     unit = _number(round(_quota_unit(vote.on, game), 1))
-    return f"{words}. {_quota(vote.on, game, f'that share of {unit} apples')}"
+    return f"{text}. {_quota(vote.on, game, f'that share of {unit} apples')}"
 
 
 def _sanctioner(sanctioner: Sanctioner) -> str:
     if sanctioner.agents is not None:
         return f"Only {_agents(sanctioner.agents)} may fire."
-    words = f"Only one agent may fire, which all elect {_every(sanctioner.period_episodes)}"
-    return f"{words}{_override(sanctioner.override_prob)}."
+    text = f"Only one agent may fire, which all elect {_every(sanctioner.period_episodes)}"
+    return f"{text}{_override(sanctioner.override_prob)}."
 
 
 def _graduated_sanctions(sanctions: GraduatedSanctions, game: Game) -> str:
@@ -245,20 +259,20 @@ def _graduated_sanctions(sanctions: GraduatedSanctions, game: Game) -> str:
     if sanctions.on != "tags" and is_broken:
         offences.append(f"a turn in which it breaks a rule{_noticed(game)}")
     turns = _missed(_turns_missed(game, sanctions), sanctions)
-    words = f"An agent's offences ({' or '.join(offences)}) cost it a time-out of {turns}"
-    words += f" and {_by_level(sanctions.fines, 'apple')}" * any(sanctions.fines)
+    text = f"An agent's offences ({' or '.join(offences)}) cost it a time-out of {turns}"
+    text += f" and {_by_level(sanctions.fines, 'apple')}" * any(sanctions.fines)
     if sanctions.recovery_steps is None:
-        return f"{words}."
-    return f"{words}; each {_turns(sanctions.recovery_steps)} without one take one back."
+        return f"{text}."
+    return f"{text}; each {_turns(sanctions.recovery_steps)} without one take one back."
 
 
 def _may(fine: float | None) -> str:
-    """Return "can" where a rule stops what it forbids, "may" where that has a price."""
+    """Return "can" for a rule that makes something impossible, "may" for one that fines it."""
     return "can" if fine is None else "may"
 
 
 def _breach(fine: float | None, game: Game) -> str:
-    """Say what happens to who picks against a rule, after the sentence about the rule; "" if nobody can."""
+    """Return a sentence about the cost of breaking the rule just told; "" if it cannot be broken."""
     return "" if fine is None else f" Each apple picked against this rule {_costs(fine, game)}."
 
 
@@ -291,20 +305,22 @@ def _agents(indices: Sequence[int]) -> str:
 
 
 def _missed(missed: Sequence[int], sanctions: GraduatedSanctions | None) -> str:
-    """Say the turns of a time-out, by level; the least and the most where they depend on who tags, too."""
+    """Return the length of a time-out in words: by level, or its range if it also depends on the shooter."""
     if sanctions is not None and sanctions.is_table:
         return f"{min(missed):,} to {_turns(max(missed))}, by who tags it and how often it was tagged"
     return _by_level(missed, "turn")
 
 
 def _by_level(numbers: Sequence[float], unit: str) -> str:
-    """Say the amounts of levels, e.g. "4 turns (24, then 99 as offences add up)"; the last one holds for all
-    higher levels."""
-    levels = [*numbers]
-    while len(levels) > 1 and levels[-1] == levels[-2]:
-        levels.pop()
-    more = ", then ".join(map(_number, levels[1:]))
-    return _amount(levels[0], unit) + (f" ({more} as offences add up)" if more else "")
+    """Return amounts by level in words, e.g. "4 turns (24, then 99 as offences add up)".
+
+    The last amount applies to all higher levels, so that repetitions of it are left out.
+    """
+    amounts = [*numbers]
+    while len(amounts) > 1 and amounts[-1] == amounts[-2]:
+        amounts.pop()
+    later_amounts = ", then ".join(map(_number, amounts[1:]))
+    return _amount(amounts[0], unit) + (f" ({later_amounts} as offences add up)" if later_amounts else "")
 
 
 def _number(value: float) -> str:
@@ -328,11 +344,12 @@ def _percent(share: float) -> str:
 
 
 def legend_of(games: Iterable[Game]) -> str:
-    """Say what the signs on the boards of these games mean, in sentences; only signs that can appear."""
-    return " ".join(dict.fromkeys(sign for game in games for sign in _signs(game)))
+    """Return sentences that explain the signs on the boards of games; only signs that can appear there."""
+    return " ".join(dict.fromkeys(sentence for game in games for sentence in _sign_sentences(game)))
 
 
-def _signs(game: Game) -> list[str]:
+def _sign_sentences(game: Game) -> list[str]:
+    """Return a sentence for each sign that can appear on the board of a game."""
     signs = [
         "A number on a colour is an agent, its triangle points where it looks.",
         "Green is an apple, dim a place without one.",

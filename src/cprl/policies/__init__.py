@@ -1,12 +1,11 @@
-"""From observations to actions.
+"""Policies: they map what agents observe to actions.
 
 Modules, in the order in which one reads them:
-    lanes           LaneActor: many agents at once, by the values or logits of their networks
-    scripted        agents that follow a rule
-    scripted_rules  these rules, compiled
-    tabular         tables in which agents look actions up
-    decisions       Decider: what agents decide at an episode's begin; Bandit: how they learn it
-    assignment      AgentPolicies: which policy controls which agents
-    present         PresentPolicy: the first replica's agents as they are now, beside the training
-    rng             names and seeds of lanes, and random numbers of each lane's own
+    actors          LaneActor: an actor of many agents at once, which reads their networks' values or logits
+    scripted        ScriptedActor: agents that follow a fixed rule and do not learn
+    scripted_rules  the rules of scripted agents, as functions that are compiled
+    tabular         tables of action values, in which agents look actions up
+    decisions       Decider: how agents vote and elect; Bandit: how they learn to
+    joint_policy    JointPolicy: the policy of all agents of a game, made of their actors
+    rng             names and seeds of lanes, and independent random numbers for each lane
 """

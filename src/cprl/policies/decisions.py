@@ -1,8 +1,9 @@
-"""Decider: what all agents decide at an episode's begin, ("agents", "decision"), as part of a policy; and
-Bandit, how agents learn it from the returns of episodes.
+"""How agents vote: `Decider`, the part of a policy that chooses on ballots, and `Bandit`, a learner of votes.
 
-A decision is one number for all ballots of a game, see `cprl.Game.ballots`. Here each ballot's choice is made
-by itself: V ballots with 5 choices each are V tables of 5 values, not one of 5**V.
+In games with votes or elections all agents decide when an episode begins. An agent's decision, the entry
+("agents", "decision"), is one number that says its choices on all ballots, see `cprl.Game.ballots`. Choices
+on different ballots are learned separately: V ballots with 5 choices each are V tables of 5 values, and not
+one table of 5**V.
 """
 
 from collections.abc import Mapping, Sequence
@@ -17,48 +18,52 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from cprl.commons.game import Game
 from cprl.policies.rng import Purpose, lane_names, lane_seeds
 from cprl.values import Positive, Range, Share, Value
-from cprl.values.arrays import Bool, Float64, Int64
+from cprl.values.array_types import Bool, Float64, Int64
 
 UNTRIED = -np.inf
 """The value of a choice that an agent has never made."""
 
 
 def ballot_sizes(game: Game) -> tuple[int, ...]:
-    """The number of choices of each ballot of a game."""
+    """Return the number of choices of each ballot of a game."""
     return tuple(len(ballot.choices) for ballot in game.ballots)
 
 
 def choices_of(decision: Int64, sizes: Sequence[int]) -> Int64:
-    """The choice on each ballot, int64 [..., V], that decisions, int64 [...], make."""
+    """Return the choices on V ballots, int64 [..., V], that some decisions, int64 [...], stand for.
+
+    The first ballot changes fastest: with 3 and 2 choices decision 4 is the choices (1, 1).
+
+    Args:
+        sizes: the number of choices of each ballot.
+    """
     return np.stack(np.unravel_index(decision, tuple(sizes), order="F"), -1)
 
 
 def decision_of(choices: Int64, sizes: Sequence[int]) -> Int64:
-    """The decisions, int64 [...], that make these choices, int64 [..., V]."""
-    places = np.cumprod([1, *sizes[:-1]], dtype=np.int64)
-    decisions: Int64 = (choices * places).sum(-1)
-    return decisions
+    """Return the decisions, int64 [...], that stand for some choices, int64 [..., V]; see `choices_of`."""
+    strides = np.cumprod([1, *sizes[:-1]], dtype=np.int64)
+    return (choices * strides).sum(-1)
 
 
 class Decider(nn.Module):
-    """Decides for the N agents of k worlds of each of R replicas; this one learns nothing.
+    """Decides for the N agents of k worlds of each of R replicas; it learns nothing.
 
-    An agent chooses on a ballot when it is due, and keeps its choice until it is due again. It takes the
-    choice with the highest value, of equal ones the first, or with probability `epsilon` any, all equally
-    likely; it does the latter under `ExplorationType.RANDOM` alone. Agents `by_chance` always choose so. The
-    numbers that an agent draws depend on its own seed, its world and how often it has decided there, on
-    nothing else.
+    An agent chooses on a ballot when the ballot is due, and keeps its choice until it is due again. It takes
+    the choice with the highest value, the first of equal ones. With probability `epsilon` it takes any choice
+    instead, all equally likely, under `ExplorationType.RANDOM` alone. The random numbers of an agent depend
+    only on its own seed, its world, and how often it has decided there.
 
     Args:
-        sizes: the number of choices of each ballot, V of them, see `ballot_sizes`.
-        seeds: of each lane, lane = replica x N + agent.
+        sizes: the number of choices of each of V ballots, see `ballot_sizes`.
+        seeds: the seed of each lane, lane = replica x N + agent.
         agents: the number of agents N.
         worlds: the number of worlds k of each replica, consecutive in the batch.
-        values: float64 [R, N, C] for the C choices of all ballots one after the other, `UNTRIED` where there
-            is none; not copied, so that it follows what is learned. None for agents that all decide by
-            chance.
-        epsilon: float64 [R, N], 0..1, likewise; None for 0.
-        by_chance: bool [N]; None for nobody.
+        values: float64 [R, N, C], the values of the C choices of all ballots, ballot after ballot; `UNTRIED`
+            for a choice that was never made. Not copied, so that the decider follows what is learned. None
+            for agents that all choose at random.
+        epsilon: float64 [R, N], 0..1, not copied either; None for 0.
+        by_chance: bool [N], marks agents that always choose at random; None for no agent.
     """
 
     def __init__(
@@ -74,65 +79,87 @@ class Decider(nn.Module):
     ) -> None:
         super().__init__()
         self.sizes = tuple(sizes)
-        self.agents, self.worlds, self.replicas = agents, worlds, len(seeds) // agents
+        self.agents = agents
+        self.worlds = worlds
+        self.replicas = len(seeds) // agents
         self._seeds = [tuple(seed) for seed in seeds]
-        of_agents = self.replicas, self.agents
-        self.values = np.zeros((*of_agents, sum(self.sizes))) if values is None else values
-        self.epsilon = np.zeros(of_agents) if epsilon is None else epsilon
+        size = self.replicas, self.agents
+        self.values = np.zeros((*size, sum(self.sizes))) if values is None else values
+        self.epsilon = np.zeros(size) if epsilon is None else epsilon
         self.by_chance = np.full(self.agents, values is None)
         if by_chance is not None:
             self.by_chance |= np.array(by_chance, np.bool_)
         batch = self.replicas * self.worlds
         self._choices = np.zeros((batch, self.agents, len(self.sizes)), np.int64)
+        """The latest choice of each agent of each world on each ballot, [R x k, N, V]."""
         self._decided = np.zeros(batch, np.int64)
-        self._held: Tensor | None = None
+        """How often the agents of each world have decided, [R x k]."""
+        self._decisions: Tensor | None = None
+        """The decisions that stand for `_choices`, [R x k, N]; None before the first."""
 
     def decide(self, due: Tensor) -> Tensor:
-        """Return the decisions of all agents, int64 [R x k, N], which do not change later.
-
-        `due`, bool [R x k, V], says which ballots are held in the coming turn."""
-        held = due.numpy(force=True)
-        if self._held is None or np.count_nonzero(held):
-            self._choose(held)
-            decisions = decision_of(self._choices, self.sizes)
-            object.__setattr__(self, "_held", torch.from_numpy(decisions).to(due.device))
-        assert self._held is not None
-        return self._held
-
-    def learn(self, replica: int, decision: Int64, returns: Float64) -> None:
-        """Learns from an episode of a replica that has ended.
+        """Return the decisions of all agents, int64 [R x k, N]; the tensor is not changed later.
 
         Args:
-            decision: int64 [N], what the agents had decided.
-            returns: float64 [N], what each of them wants to be high.
+            due: bool [R x k, V], marks the ballots that are held in the coming turn.
+        """
+        is_due = due.numpy(force=True)
+        if self._decisions is None or np.count_nonzero(is_due):
+            self._choose(is_due)
+            self._set_decisions(due.device)
+        assert self._decisions is not None
+        return self._decisions
+
+    def _set_decisions(self, device: torch.device | str) -> None:
+        """Make the decisions that stand for the latest choices."""
+        decisions = torch.from_numpy(decision_of(self._choices, self.sizes)).to(device)
+        object.__setattr__(self, "_decisions", decisions)  # past the checks of modules, which take longer
+
+    def learn(self, replica: int, decision: Int64, returns: Float64) -> None:
+        """Learn from an episode that has ended; this class learns nothing.
+
+        Args:
+            replica: the index of the replica that played the episode.
+            decision: int64 [N], the agents' decisions in it.
+            returns: float64 [N], the agents' returns by the rewards that they learn from.
         """
 
     def _choose(self, due: Bool) -> None:
-        """Chooses anew on the ballots that are due, bool [R x k, V]."""
+        """Replace the choices on the ballots that are due, bool [R x k, V]."""
         worlds = np.flatnonzero(due.any(1))
-        replicas, numbers = worlds // self.worlds, self._numbers(worlds)
-        explores = exploration_type() in (ExplorationType.RANDOM, None)
-        chance = self.epsilon[replicas] if explores else np.zeros((len(worlds), self.agents))
-        chance = np.where(self.by_chance, 1.0, chance)
-        drawn = (numbers[..., 1] * self.sizes).astype(np.int64)
-        new = np.where(numbers[..., 0] < chance[..., None], drawn, self.best()[replicas])
-        self._choices[worlds] = np.where(due[worlds, None], new, self._choices[worlds])
+        replicas = worlds // self.worlds
+        numbers = self._draw_numbers(worlds)
+        may_explore = exploration_type() in (ExplorationType.RANDOM, None)
+        epsilon = self.epsilon[replicas] if may_explore else np.zeros((len(worlds), self.agents))
+        epsilon = np.where(self.by_chance, 1.0, epsilon)
+        random_choices = (numbers[..., 1] * self.sizes).astype(np.int64)
+        explores = numbers[..., 0] < epsilon[..., None]
+        new_choices = np.where(explores, random_choices, self.best()[replicas])
+        self._choices[worlds] = np.where(due[worlds, None], new_choices, self._choices[worlds])
 
     def best(self) -> Int64:
-        """The choice with the highest value on each ballot, int64 [R, N, V]."""
-        of_ballots = np.split(self.values, np.cumsum(self.sizes)[:-1], axis=-1)
-        return np.stack([values.argmax(-1) for values in of_ballots], -1)
+        """Return the choice with the highest value on each ballot, int64 [R, N, V]."""
+        by_ballot = np.split(self.values, np.cumsum(self.sizes)[:-1], axis=-1)
+        return np.stack([values.argmax(-1) for values in by_ballot], -1)
 
-    def _numbers(self, worlds: Int64) -> Float64:
-        """Two uniform numbers in 0..1 for each of these worlds, agent and ballot, [worlds, N, V, 2]."""
+    def _draw_numbers(self, worlds: Int64) -> Float64:
+        """Draw two uniform numbers in 0..1 for each agent and ballot of some worlds, [n, N, V, 2].
+
+        An agent's seed is that of its lane and how often it has decided before; one generator of this seed
+        draws the numbers of all worlds of the replica.
+
+        Args:
+            worlds: the indices of n worlds in the batch.
+        """
         numbers = np.empty((len(worlds), self.agents, len(self.sizes), 2))
-        together = np.stack([worlds // self.worlds, self._decided[worlds]], 1)
-        for replica, decided in np.unique(together, axis=0).tolist():
-            at = np.flatnonzero((together == (replica, decided)).all(1))
+        replica_and_decided = np.stack([worlds // self.worlds, self._decided[worlds]], 1)
+        for replica, decided in np.unique(replica_and_decided, axis=0).tolist():
+            is_drawn = (replica_and_decided == (replica, decided)).all(1)
+            rows = np.flatnonzero(is_drawn)
             for agent in range(self.agents):
                 seed = np.random.SeedSequence((*self._seeds[replica * self.agents + agent], decided))
                 drawn = np.random.Generator(np.random.Philox(seed)).random((self.worlds, len(self.sizes), 2))
-                numbers[at, agent] = drawn[worlds[at] % self.worlds]
+                numbers[rows, agent] = drawn[worlds[rows] % self.worlds]
         self._decided[worlds] += 1
         return numbers
 
@@ -142,48 +169,50 @@ class Decider(nn.Module):
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
         self._choices[:] = state["choices"].numpy(force=True)
         self._decided[:] = state["decided"].numpy(force=True)
-        held = self._held
-        if held is not None or self._decided.any():
-            device = "cpu" if held is None else held.device
-            decisions = torch.from_numpy(decision_of(self._choices, self.sizes)).to(device)
-            object.__setattr__(self, "_held", decisions)
+        if self._decisions is not None or self._decided.any():
+            device = "cpu" if self._decisions is None else self._decisions.device
+            self._set_decisions(device)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Bandit(Value):
-    """How an agent learns its decisions: epsilon-greedy, with a value for each choice of each ballot.
+    """How an agent learns to vote: an epsilon-greedy bandit with a value for each choice of each ballot.
 
-    After an episode with the return G the value of the choice that was in it moves towards G, by
-    Q + step (G - Q), where the step is 1 over the number of times that it was made, and never below
-    `step_size`. The first numbers are thus plain means; later ones follow what others learn meanwhile.
+    After an episode with return G, the value Q of the choice that the agent made in it becomes
+    Q + step (G - Q). The step is 1 over the number of times that this choice was made, and at least
+    `step_size`. So a value is first the plain mean of returns; later it follows what other agents learn.
 
     Source: Sutton and Barto, "Reinforcement Learning" (2nd edition, 2018), sections 2.4 and 2.5.
     """
 
     step_size: Annotated[float, Range(1e-6, 1)] = 0.1
-    """The smallest step by which a value moves towards a return."""
+    """The smallest share by which a value moves towards a return."""
     epsilon_start: Share = 1.0
-    """Probability of a random choice in the first episode. While others choose at random, a vote often
-    decides, so its value shows."""
+    """Probability of a random choice in the first episode. While other agents choose at random, one vote
+    often decides the outcome, so that the agent sees what its vote is worth."""
     epsilon_end: Share = 0.1
     """Probability of a random choice after the decay."""
     epsilon_decay_episodes: Positive = 100
     """Episodes of the linear decay."""
 
     def epsilon(self, episode: int) -> float:
-        """The probability of a random choice in an episode, counted from 0."""
-        done = min(1.0, episode / self.epsilon_decay_episodes)
-        return self.epsilon_start + done * (self.epsilon_end - self.epsilon_start)
+        """Return the probability of a random choice in an episode, counted from 0."""
+        decay_share = min(1.0, episode / self.epsilon_decay_episodes)
+        return self.epsilon_start + decay_share * (self.epsilon_end - self.epsilon_start)
 
 
 class BanditDecider(Decider):
-    """The agents of R replicas, of which some learn their decisions, beside others that do not; those of a
-    replica learn from the episodes of all of its worlds.
+    """A decider of R replicas in which some agents learn to vote, each from the episodes of all worlds of its
+    replica.
 
     Args:
-        bandits: by agent; None for those that do not learn.
-        stored: the values, float64 [C] for each replica, of those that decide by what they have learned in an
-            earlier run, by agent. Agents that are neither here nor have a bandit decide by chance.
+        sizes: see `Decider`, also for `worlds`.
+        bandits: by agent; None for agents that do not learn to vote.
+        stored: the values that agents learned in an earlier run, float64 [C] for each replica, by agent.
+            Agents with neither such values nor a bandit choose at random.
+        replicas: the number of replicas R.
+        seed: the seed of the run.
+        first_replica: the index of the first replica.
     """
 
     def __init__(
@@ -199,62 +228,61 @@ class BanditDecider(Decider):
     ) -> None:
         agents = len(bandits)
         self._seed = seed
-        self._numbers_of_replicas = range(first_replica, first_replica + replicas)
+        self._replica_indices = range(first_replica, first_replica + replicas)
+        seeds = lane_seeds(
+            seed, replicas=self._replica_indices, agents=range(agents), purpose=Purpose.DECISIONS
+        )
         super().__init__(
             sizes,
-            seeds=lane_seeds(
-                seed,
-                replicas=self._numbers_of_replicas,
-                agents=range(agents),
-                purpose=Purpose.DECISIONS,
-            ),
+            seeds=seeds,
             agents=agents,
             worlds=worlds,
-            values=_table(sizes, stored, replicas=replicas, agents=agents),
+            values=_new_values(sizes, stored, replicas=replicas, agents=agents),
             epsilon=np.zeros((replicas, agents)),
             by_chance=[bandit is None and agent not in stored for agent, bandit in enumerate(bandits)],
         )
         self.bandits = tuple(bandits)
         self.times = np.zeros(self.values.shape, np.int64)
-        """int64 [R, N, C], how often each choice was learned from."""
+        """int64 [R, N, C], the number of episodes from which each choice was learned."""
         self.episodes = np.zeros(replicas, np.int64)
-        """int64 [R], episodes learned from."""
-        self._explore_as_due()
+        """int64 [R], the number of episodes that each replica has learned from."""
+        self._update_epsilon()
 
     def learn(self, replica: int, decision: Int64, returns: Float64) -> None:
-        """Learns from an episode of a replica; a return that is not finite is left out."""
-        firsts = np.cumsum([0, *self.sizes[:-1]])
-        for agent, made in enumerate(choices_of(decision, self.sizes) + firsts):
+        """Learn from an episode, see `Decider.learn`; a return that is not finite changes no value."""
+        first_columns = np.cumsum([0, *self.sizes[:-1]])  # of each ballot in `values`
+        columns_by_agent = choices_of(decision, self.sizes) + first_columns
+        for agent, columns in enumerate(columns_by_agent):
             bandit = self.bandits[agent]
             if bandit is None or not np.isfinite(returns[agent]):
                 continue
-            for choice in made:
-                self.times[replica, agent, choice] += 1
-                times, value = self.times[replica, agent, choice], self.values[replica, agent, choice]
-                before = 0.0 if times == 1 else value
+            for column in columns:
+                self.times[replica, agent, column] += 1
+                times = self.times[replica, agent, column]
+                value = 0.0 if times == 1 else self.values[replica, agent, column]
                 step = max(bandit.step_size, 1 / times)
-                self.values[replica, agent, choice] = before + step * (returns[agent] - before)
+                self.values[replica, agent, column] = value + step * (returns[agent] - value)
         self.episodes[replica] += 1
-        self._explore_as_due()
+        self._update_epsilon()
 
-    def _explore_as_due(self) -> None:
+    def _update_epsilon(self) -> None:
+        """Set the epsilon of each agent that learns to that of the current episode of its replica."""
         for agent, bandit in enumerate(self.bandits):
             if bandit is not None:
                 self.epsilon[:, agent] = [bandit.epsilon(episode) for episode in self.episodes.tolist()]
 
-    def evaluation(self, worlds: int) -> Decider:
-        """The same agents without exploration, for `worlds` worlds of each replica."""
-        return self._without_exploration(Purpose.EVALUATED_DECISIONS, self.replicas, worlds)
+    def without_exploration(self, purpose: Purpose, *, replicas: int, worlds: int) -> Decider:
+        """Return a decider of the same agents that does not explore.
 
-    def first_replica(self) -> Decider:
-        """The same agents in one world of the first replica, without exploration at first."""
-        return self._without_exploration(Purpose.EXHIBITED_DECISIONS, 1, 1)
-
-    def _without_exploration(self, purpose: Purpose, replicas: int, worlds: int) -> Decider:
-        numbers = self._numbers_of_replicas[:replicas]
+        Args:
+            purpose: the purpose of its random numbers.
+            replicas: the number of replicas, from the first on.
+            worlds: the number of worlds of each replica.
+        """
+        indices = self._replica_indices[:replicas]
         return Decider(
             self.sizes,
-            seeds=lane_seeds(self._seed, replicas=numbers, agents=range(self.agents), purpose=purpose),
+            seeds=lane_seeds(self._seed, replicas=indices, agents=range(self.agents), purpose=purpose),
             agents=self.agents,
             worlds=worlds,
             values=self.values[:replicas],
@@ -262,13 +290,14 @@ class BanditDecider(Decider):
         )
 
     def learned(self) -> dict[str, Tensor]:
-        """A copy of the values of each agent that learns, float64 [C], by "replica_0/agent_0" and so on."""
+        """Return copies of the values of the agents that learn, float64 [C], by "replica_0/agent_0" and so
+        on."""
         learning = [agent for agent, bandit in enumerate(self.bandits) if bandit is not None]
-        names = lane_names(replicas=self._numbers_of_replicas, agents=learning)
+        names = lane_names(replicas=self._replica_indices, agents=learning)
         return dict(zip(names, torch.tensor(self.values[:, learning]).flatten(0, 1), strict=True))
 
     def get_extra_state(self) -> dict[str, Any]:
-        """All that the future depends on; part of `state_dict`."""
+        """Return the state of all agents, from which training continues exactly; part of `state_dict`."""
         arrays = {"values": self.values, "times": self.times, "episodes": self.episodes}
         copies = {name: torch.tensor(array) for name, array in arrays.items()}
         return {**super().get_extra_state(), **copies, "learned": self.learned()}
@@ -277,7 +306,7 @@ class BanditDecider(Decider):
         super().set_extra_state(state)
         for name in ("values", "times", "episodes"):
             getattr(self, name)[:] = state[name].numpy(force=True)
-        self._explore_as_due()
+        self._update_epsilon()
 
 
 def stored_decisions(
@@ -289,12 +318,14 @@ def stored_decisions(
     seed: int,
     purpose: Purpose = Purpose.EVALUATED_DECISIONS,
 ) -> Decider | None:
-    """Return what agents decide by values of earlier runs, without exploration; None in a game that asks
-    nothing.
+    """Return a decider of agents that vote by the values of earlier runs and do not explore.
+
+    Return None for a game without ballots.
 
     Args:
-        stored: as of `BanditDecider`; agents that are not here decide by chance.
-        purpose: what their random numbers are for.
+        stored: the values of earlier runs, see `BanditDecider`; agents without values choose at random.
+        replicas: the indices of the replicas that play.
+        purpose: the purpose of the random numbers.
     """
     sizes = ballot_sizes(game)
     if not sizes:
@@ -304,16 +335,16 @@ def stored_decisions(
         seeds=lane_seeds(seed, replicas=replicas, agents=range(game.agents), purpose=purpose),
         agents=game.agents,
         worlds=worlds,
-        values=_table(sizes, stored, replicas=len(replicas), agents=game.agents),
+        values=_new_values(sizes, stored, replicas=len(replicas), agents=game.agents),
         by_chance=[agent not in stored for agent in range(game.agents)],
     )
 
 
-def _table(
+def _new_values(
     sizes: Sequence[int], stored: Mapping[int, Sequence[Tensor]], *, replicas: int, agents: int
 ) -> Float64:
-    """The values of all choices, float64 [R, N, C]."""
+    """Return the values of all choices, float64 [R, N, C]: stored ones, and `UNTRIED` for other agents."""
     values = np.full((replicas, agents, sum(sizes)), UNTRIED)
-    for agent, of_replicas in stored.items():
-        values[:, agent] = torch.stack(list(of_replicas)).numpy(force=True)
+    for agent, by_replica in stored.items():
+        values[:, agent] = torch.stack(list(by_replica)).numpy(force=True)
     return values

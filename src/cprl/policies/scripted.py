@@ -1,4 +1,4 @@
-"""ScriptedActor: agents that follow a scripted policy and do not learn.
+"""ScriptedActor: agents that follow a fixed rule, a scripted policy, and do not learn.
 
 They see what a learning agent sees: their observation window. Under `Quirks2019.paint_over`, where an agent's
 own heading mark covers the cell ahead of it, they also see whether this cell holds an apple.
@@ -49,13 +49,24 @@ from cprl.commons.quirks import paints_over
 from cprl.commons.spaces import Spaces
 from cprl.pictures.decoding import UNSEEN, classes_seen
 from cprl.policies import scripted_rules
-from cprl.policies.lanes import ActorOfLanes, LaneActor
-from cprl.policies.scripted_rules import AGENT, APPLE, NUMBERS, OPEN, UNKNOWN, WALL, Frame, Scratch, Settings
-from cprl.values.arrays import UInt8
+from cprl.policies.actors import ActorOfLanes, LaneActor
+from cprl.policies.scripted_rules import (
+    AGENT,
+    APPLE,
+    NUMBERS,
+    OPEN,
+    UNKNOWN,
+    WALL,
+    Frame,
+    SearchBuffers,
+    Settings,
+)
+from cprl.values.array_types import UInt8
 
 ScriptedPolicy = Literal["random", "greedy", "sustainable", "territorial", "aggressive", "pacifist"]
 SCRIPTED_POLICIES: Final[tuple[ScriptedPolicy, ...]] = get_args(ScriptedPolicy)
-"""In the order of the constants RANDOM, GREEDY, ... of `cprl.policies.scripted_rules`."""
+"""The names of all scripted policies, in the order of the constants RANDOM, GREEDY, ... of
+`cprl.policies.scripted_rules`."""
 
 SPARE: Final = 3
 """The number of apples that "sustainable" leaves near each apple it harvests. With the published
@@ -71,6 +82,11 @@ class ScriptedActor(ActorOfLanes):
     seconds; the compiled code is cached on disk.
 
     Args:
+        policy: the scripted policy.
+        game: the game that the agents play.
+        seeds: the seed of each lane, lane = replica x S + agent.
+        agents: the number of agents S of each replica.
+        worlds: the number of worlds k of each replica, consecutive in the batch.
         spare: for "sustainable": the number of other apples near an apple that it harvests, at least 1.
 
     `epsilon`, initially 0, is the probability of a random action under `ExplorationType.RANDOM`; under other
@@ -98,13 +114,16 @@ class ScriptedActor(ActorOfLanes):
                 "Rules.harvest_action is True; allowed with scripted policies but 'random': False, because "
                 "no window shows what is under an agent"
             )
-        self.policy, self.game, self.epsilon = policy, game, 0.0
+        self.policy = policy
+        self.game = game
+        self.epsilon = 0.0
         if paints_over(game.rules.quirks):
             self.in_keys = ("observation", keys.APPLE_AHEAD[1])
-        self._settings, self._role_of_class = _settings(game, spare), _roles()
+        self._settings = _settings(game, spare)
+        self._role_of_class = _roles()
         self._rim, self._frame = _frame(game)
         size = self._frame.stride * (game.rules.window_rows + 2 * self._rim)
-        self._scratch = Scratch(*np.zeros((2, size), np.bool_), *np.zeros((3, size), np.int32))
+        self._scratch = SearchBuffers(*np.zeros((2, size), np.bool_), *np.zeros((3, size), np.int32))
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set("action", self.choose(*map(tensordict.get, self.in_keys)))
@@ -117,10 +136,11 @@ class ScriptedActor(ActorOfLanes):
             apple_ahead: `cprl.keys.APPLE_AHEAD`, bool [replicas x k, S, 1], under `Quirks2019.paint_over`.
         """
         explores = exploration_type() in (ExplorationType.RANDOM, None)
+        epsilon = float(self.epsilon) if explores else 0.0
         chosen = np.empty(observation.shape[:2], np.int64)
         compiled_for_cpu(scripted_rules.choose_all, inline=False)(
             SCRIPTED_POLICIES.index(self.policy),
-            float(self.epsilon) if explores else 0.0,
+            epsilon,
             self._framed(observation, apple_ahead),
             self._frame,
             self._numbers(),
@@ -131,21 +151,26 @@ class ScriptedActor(ActorOfLanes):
         return torch.from_numpy(chosen).to(observation.device)
 
     def _framed(self, observation: Tensor, apple_ahead: Tensor | None) -> UInt8:
-        """The roles of the cells each agent sees, in a frame of wall: uint8 [replicas x k x S, cells]."""
+        """Return the roles of the cells in each agent's window, with a frame of wall around them: uint8
+        [replicas x k x S, cells]."""
         ahead = observation.numpy(force=True)[..., : self.game.rules.window_rows, :]
-        seen, rim = classes_seen(self.game, ahead), self._rim
-        count, (rows, columns) = seen.shape[0] * seen.shape[1], seen.shape[2:]
+        seen = classes_seen(self.game, ahead)
+        rim = self._rim
+        rows, columns = seen.shape[2:]
+        count = seen.shape[0] * seen.shape[1]
         roles = np.full((count, rows + 2 * rim, columns + 2 * rim), WALL, np.uint8)
         roles[:, rim:-rim, rim:-rim] = self._role_of_class[seen].reshape(count, rows, columns)
-        row, middle = rim + rows - 1, rim + columns // 2
+        row = rim + rows - 1
+        middle = rim + columns // 2
         roles[:, row, middle] = OPEN
         if apple_ahead is not None:
-            before = roles[:, row - 1, middle]  # of one row, the frame of wall
-            before[apple_ahead.numpy(force=True).reshape(-1) & (before == OPEN)] = APPLE
+            cell_ahead = roles[:, row - 1, middle]  # a wall of the frame if the window has a single row
+            cell_ahead[apple_ahead.numpy(force=True).reshape(-1) & (cell_ahead == OPEN)] = APPLE
         return roles.reshape(count, -1)
 
     def _numbers(self) -> Any:
-        """The random numbers of this turn in the order of the batch: float64 [replicas x k x S, NUMBERS]."""
+        """Draw the random numbers of this turn in the order of the batch: float64 [replicas x k x S,
+        NUMBERS]."""
         drawn = self.rng.next().numpy().reshape(self.replicas, self.agents, self.worlds, NUMBERS)
         return drawn.transpose(0, 2, 1, 3).reshape(-1, NUMBERS)
 
@@ -158,7 +183,8 @@ def scripted_lanes(
     agents: int,
     worlds: int = 1,
 ) -> nn.Module:
-    """The fastest actor for agents that follow a scripted policy in a game, or at random in any spaces."""
+    """Return the fastest actor for agents that follow a scripted policy in a game, or at random in any
+    spaces."""
     if policy == "random":
         spaces = playing if isinstance(playing, Spaces) else playing.spaces
         return LaneActor(None, spaces.actions, seeds=seeds, agents=agents, worlds=worlds)
@@ -171,6 +197,7 @@ def scripted_lanes(
 
 
 def _settings(game: Game, spare: int) -> Settings:
+    """Return the properties of a game by which scripted agents choose."""
     rules = game.rules
     return Settings(
         actions=game.tables.silent_actions,
@@ -186,8 +213,10 @@ def _settings(game: Game, spare: int) -> Settings:
 
 
 def _frame(game: Game) -> tuple[int, Frame]:
-    """The width of the frame on each side, and its layout."""
-    rules, rows, columns = game.rules, game.rules.window_rows, game.rules.window_columns
+    """Return the width of the frame on each side, and its layout."""
+    rules = game.rules
+    rows = rules.window_rows
+    columns = rules.window_columns
     reach = min(int(rules.regrow_radius_cells), max(rows, columns))
     rim = max(1, reach)
     stride = columns + 2 * rim
@@ -203,10 +232,11 @@ def _frame(game: Game) -> tuple[int, Frame]:
 
 
 def _roles() -> UInt8:
-    """The role of each class of cell, uint8 [256]."""
+    """Return the role of each class of cell, uint8 [256]."""
     roles = np.full(256, AGENT, np.uint8)
     open_ground = (cells.GROUND, cells.MARK, cells.BEAM)
     roles[[*open_ground, cells.WATER, cells.WASTE, cells.CLEANING]] = OPEN
-    roles[cells.APPLE], roles[cells.WALL] = APPLE, WALL
+    roles[cells.APPLE] = APPLE
+    roles[cells.WALL] = WALL
     roles[UNSEEN] = UNKNOWN
     return roles

@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from cprl.values.arrays import Bool, Float64, Int32, Int64, UInt8
+from cprl.values.array_types import Bool, Float64, Int32, Int64, UInt8
 
 OPEN, APPLE, AGENT, UNKNOWN, WALL = range(5)
 """The roles of cells; paths can reach those up to AGENT. The agent's own cell is OPEN."""
@@ -32,8 +32,8 @@ class Frame(NamedTuple):
     """int32 [n], the offsets to all cells that count as near; the frame is wide enough for them."""
 
 
-class Scratch(NamedTuple):
-    """Working memory, [cells] each: one entry for each cell of a framed window."""
+class SearchBuffers(NamedTuple):
+    """The working memory of a search, [cells] each: one entry for each cell of a framed window."""
 
     blocked: Bool
     """bool, the cells that no path passes through."""
@@ -42,13 +42,13 @@ class Scratch(NamedTuple):
     steps: Int32
     """int32, the distance of each cell from the agent in steps; -1 if it cannot be reached."""
     others_steps: Int32
-    """int32, the distance of each cell from the nearest other agent, likewise."""
+    """int32, the distance of each cell from the nearest other agent; -1 if none can reach it."""
     queue: Int32
     """int32, the cells that the search has reached, in the order of their distance."""
 
 
 def spread(roles: UInt8, frame: Frame, blocked: Bool, steps: Int32, queue: Int32, known: int) -> None:
-    """Breadth-first search from the first `known` cells of the queue; fills in `steps`.
+    """Search breadth-first from the first `known` cells of the queue; fill in `steps`.
 
     `steps` is 0 at these cells and -1 elsewhere. The search reaches blocked cells but does not pass them.
     """
@@ -66,16 +66,16 @@ def spread(roles: UInt8, frame: Frame, blocked: Bool, steps: Int32, queue: Int32
                 known += 1
 
 
-def count_own_steps(roles: UInt8, frame: Frame, scratch: Scratch) -> None:
-    """Computes the distance of each cell from the agent."""
+def count_own_steps(roles: UInt8, frame: Frame, scratch: SearchBuffers) -> None:
+    """Compute the distance of each cell from the agent."""
     scratch.steps[:] = -1
     scratch.steps[frame.middle] = 0
     scratch.queue[0] = frame.middle
     spread(roles, frame, scratch.blocked, scratch.steps, scratch.queue, 1)
 
 
-def count_others_steps(roles: UInt8, frame: Frame, scratch: Scratch) -> None:
-    """Computes the distance of each cell from the nearest other agent."""
+def count_others_steps(roles: UInt8, frame: Frame, scratch: SearchBuffers) -> None:
+    """Compute the distance of each cell from the nearest other agent."""
     known = 0
     scratch.others_steps[:] = -1
     for cell in frame.cells:
@@ -86,18 +86,21 @@ def count_others_steps(roles: UInt8, frame: Frame, scratch: Scratch) -> None:
     spread(roles, frame, scratch.blocked, scratch.others_steps, scratch.queue, known)
 
 
-def nearest(frame: Frame, scratch: Scratch) -> int:
-    """The nearest target, the first of equally near ones in reading order; -1 if none can be reached."""
-    best, fewest = -1, scratch.steps.size
+def nearest(frame: Frame, scratch: SearchBuffers) -> int:
+    """Return the nearest target, the first of equally near ones in reading order; -1 if none is reachable."""
+    best = -1
+    fewest = scratch.steps.size
     for cell in frame.cells:
         if scratch.targets[cell] and 0 <= scratch.steps[cell] < fewest:
-            best, fewest = cell, scratch.steps[cell]
+            best = cell
+            fewest = scratch.steps[cell]
     return best
 
 
-def step_to(frame: Frame, goal: int, scratch: Scratch) -> int:
-    """The first cell on a shortest path to a reachable cell."""
-    steps, cell = scratch.steps, goal
+def step_to(frame: Frame, goal: int, scratch: SearchBuffers) -> int:
+    """Return the first cell on a shortest path to a reachable cell."""
+    steps = scratch.steps
+    cell = goal
     while steps[cell] > 1:
         for offset in frame.neighbours:
             if steps[cell + offset] == steps[cell] - 1 and not scratch.blocked[cell + offset]:
@@ -107,7 +110,7 @@ def step_to(frame: Frame, goal: int, scratch: Scratch) -> int:
 
 
 def is_beside_an_agent(roles: UInt8, frame: Frame, cell: int) -> bool:
-    """Whether a visible other agent is adjacent to a cell."""
+    """Return whether a visible other agent is adjacent to a cell."""
     agents = 0
     for offset in frame.neighbours:
         agents += roles[cell + offset] == AGENT
@@ -115,7 +118,7 @@ def is_beside_an_agent(roles: UInt8, frame: Frame, cell: int) -> bool:
 
 
 def apples_near(roles: UInt8, frame: Frame, cell: int) -> int:
-    """The number of visible apples near a cell, without one on the cell itself."""
+    """Count the visible apples near a cell, without one on the cell itself."""
     count = 0
     for away in frame.near:
         count += roles[cell + away] == APPLE
@@ -145,7 +148,7 @@ class Settings(NamedTuple):
     stay: int
     """The index of the action "stay"."""
     has_beam: bool
-    """Whether there is a beam action."""
+    """True if there is a beam action."""
     beam_length: int
     """The cells ahead that a beam covers for every heading, since an agent does not know its heading."""
     beam_half_width: int
@@ -157,28 +160,28 @@ class Settings(NamedTuple):
     """The number of other apples near an apple that "sustainable" harvests."""
 
 
-def target_apples(roles: UInt8, frame: Frame, scratch: Scratch) -> None:
-    """Makes all apples targets and blocks the cells of other agents."""
+def target_apples(roles: UInt8, frame: Frame, scratch: SearchBuffers) -> None:
+    """Make all apples targets and block the cells of other agents."""
     for cell in frame.cells:
         scratch.targets[cell] = roles[cell] == APPLE
         scratch.blocked[cell] = roles[cell] == AGENT
 
 
-def exclude_apple(scratch: Scratch, cell: int) -> None:
-    """Makes an apple no target and blocks its cell."""
+def exclude_apple(scratch: SearchBuffers, cell: int) -> None:
+    """Make an apple no target and block its cell."""
     scratch.targets[cell] = False
     scratch.blocked[cell] = True
 
 
-def exclude_sparse_apples(roles: UInt8, frame: Frame, settings: Settings, scratch: Scratch) -> None:
-    """Excludes the targets with fewer than `spare` other apples near them."""
+def exclude_sparse_apples(roles: UInt8, frame: Frame, settings: Settings, scratch: SearchBuffers) -> None:
+    """Exclude the targets with fewer than `spare` other apples near them."""
     for cell in frame.cells:
         if scratch.targets[cell] and apples_near(roles, frame, cell) < settings.spare:
             exclude_apple(scratch, cell)
 
 
-def exclude_apples_nearer_to_others(roles: UInt8, frame: Frame, scratch: Scratch) -> None:
-    """Excludes the targets that another agent reaches in fewer steps."""
+def exclude_apples_nearer_to_others(roles: UInt8, frame: Frame, scratch: SearchBuffers) -> None:
+    """Exclude the targets that another agent reaches in fewer steps."""
     count_own_steps(roles, frame, scratch)
     count_others_steps(roles, frame, scratch)
     for cell in frame.cells:
@@ -187,9 +190,10 @@ def exclude_apples_nearer_to_others(roles: UInt8, frame: Frame, scratch: Scratch
 
 
 def walk_to(
-    roles: UInt8, frame: Frame, goal: int, number: float, settings: Settings, scratch: Scratch
+    roles: UInt8, frame: Frame, goal: int, number: float, settings: Settings, scratch: SearchBuffers
 ) -> int:
-    """The action for the first step on a shortest path to a reachable cell; may wait for another agent."""
+    """Return the action for the first step on a shortest path to a reachable cell; it may wait for another
+    agent."""
     cell = step_to(frame, goal, scratch)
     if is_beside_an_agent(roles, frame, cell) and number < WAIT_PROB:
         return settings.stay
@@ -198,8 +202,8 @@ def walk_to(
     return RIGHT if cell == frame.middle + 1 else FORWARD
 
 
-def wander(roles: UInt8, frame: Frame, number: float, scratch: Scratch) -> int:
-    """Walks forward with WALK_ON_PROB if the cell ahead is free; otherwise turns left or right."""
+def wander(roles: UInt8, frame: Frame, number: float, scratch: SearchBuffers) -> int:
+    """Walk forward with WALK_ON_PROB if the cell ahead is free; otherwise turn left or right."""
     ahead = frame.middle - frame.stride
     if roles[ahead] <= APPLE and not scratch.blocked[ahead]:
         if number < WALK_ON_PROB:
@@ -209,7 +213,7 @@ def wander(roles: UInt8, frame: Frame, number: float, scratch: Scratch) -> int:
 
 
 def has_target(roles: UInt8, frame: Frame, settings: Settings, guards: bool) -> bool:
-    """Whether a beam would cover a visible agent; with `guards`, one that is near a visible apple."""
+    """Return whether a beam would cover a visible agent; with `guards`, one that is near a visible apple."""
     for side in range(-settings.beam_half_width, settings.beam_half_width + 1):
         begin = 0 if settings.beam_from_beside and side != 0 else 1
         end = settings.beam_length - abs(side) if settings.beam_tapers else settings.beam_length
@@ -225,24 +229,24 @@ def has_target(roles: UInt8, frame: Frame, settings: Settings, guards: bool) -> 
     return False
 
 
-def pursue(roles: UInt8, frame: Frame, number: float, settings: Settings, scratch: Scratch) -> int:
-    """Turns towards the nearest reachable agent or walks towards it; -1 if there is none."""
+def pursue(roles: UInt8, frame: Frame, number: float, settings: Settings, scratch: SearchBuffers) -> int:
+    """Turn towards the nearest reachable agent or walk towards it; -1 if there is none."""
     for cell in frame.cells:
         scratch.targets[cell] = roles[cell] == AGENT
     goal = nearest(frame, scratch)
     if goal < 0:
         return -1
-    middle = frame.middle % frame.stride
-    ahead, side = frame.middle // frame.stride - goal // frame.stride, goal % frame.stride - middle
+    ahead = frame.middle // frame.stride - goal // frame.stride
+    side = goal % frame.stride - frame.middle % frame.stride
     if abs(side) > ahead:
         return TURN_RIGHT if side > 0 else TURN_LEFT
     return walk_to(roles, frame, goal, number, settings, scratch)
 
 
 def choose(
-    policy: int, roles: UInt8, frame: Frame, numbers: Float64, settings: Settings, scratch: Scratch
+    policy: int, roles: UInt8, frame: Frame, numbers: Float64, settings: Settings, scratch: SearchBuffers
 ) -> int:
-    """The action of one agent.
+    """Choose the action of one agent.
 
     Args:
         roles: uint8 [cells], the roles of the cells of its framed window.
@@ -277,10 +281,10 @@ def choose_all(
     frame: Frame,
     numbers: Float64,
     settings: Settings,
-    scratch: Scratch,
+    scratch: SearchBuffers,
     chosen: Int64,
 ) -> None:
-    """The actions of n agents; each is random with probability `epsilon`.
+    """Choose the actions of n agents; each is random with probability `epsilon`.
 
     Args:
         roles: uint8 [n, cells], the roles of the cells of each framed window.
@@ -288,5 +292,5 @@ def choose_all(
         chosen: int64 [n], receives the actions.
     """
     for n in range(roles.shape[0]):
-        explores = numbers[n, EXPLORES] < epsilon
-        chosen[n] = choose(RANDOM if explores else policy, roles[n], frame, numbers[n], settings, scratch)
+        followed = RANDOM if numbers[n, EXPLORES] < epsilon else policy
+        chosen[n] = choose(followed, roles[n], frame, numbers[n], settings, scratch)

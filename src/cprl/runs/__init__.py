@@ -9,7 +9,7 @@ Modules, in the order in which one reads them:
     curves       tables as curves over episodes
     checkpoints  the state of a training, to resume from, or to extend
     weights      trained networks, the state of transforms, the values of decisions
-    states       what a run's directory says was done, and what follows: start, resume, extend, tidy
+    states       the state of a run's directory, and the step that follows: start, resume or extend
     loggers      TorchRL's loggers: TensorBoard, W&B
     export       a finished run, small enough to commit
 """

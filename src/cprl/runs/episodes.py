@@ -21,17 +21,17 @@ import pyarrow.parquet as pq
 from tensordict import TensorDictBase
 
 from cprl.measuring import Episode
-from cprl.measuring.registry import IN_FORCE, METRICS, SOCIAL, TOTALS, left_out
-from cprl.measuring.table import metrics_in, world_of
+from cprl.measuring.registry import IN_FORCE_PREFIX, METRICS, SOCIAL_METRICS, TOTALS, left_out_note
+from cprl.measuring.table import stored_metrics, world_of
 from cprl.runs.files import (
     RECIPE_FILE,
     RECIPE_FORMAT,
+    break_hard_links,
     read_json,
     refuse_newer,
-    refuse_special,
+    refuse_no_file,
     refuse_to_write_over,
     sync_folder,
-    take_apart,
     verify,
     write_atomically,
     write_listed,
@@ -40,31 +40,31 @@ from cprl.runs.files import (
 FILE_NAME: Final = "episodes.parquet"
 
 _ROWS_PER_GROUP: Final = 2**16
-"""Parquet files with row groups of a few rows are slow to read."""
+"""Rows of a group of a parquet file; files with small groups are slow to read."""
 
 
 def batches_in(path: Path) -> Iterator[tuple[pa.RecordBatch, int]]:
     """Yield the whole batches of a journal, each with the byte at which it ends."""
-    refuse_special(path)
+    refuse_no_file(path)
     source = pa.BufferReader(path.read_bytes())
     try:
         for batch in pa.ipc.open_stream(source):
             batch.validate()
             yield batch, source.tell()
-    except (pa.ArrowException, OSError):  # half a batch, or half the schema, at the end
+    except (pa.ArrowException, OSError):  # the journal ends within a batch, or within the schema
         return
 
 
 def read_journal(path: Path) -> pa.Table:
-    """Return the rows of a journal; of one without a whole batch, none of all columns."""
+    """Return the rows of a journal; an empty table with all columns if it holds no whole batch."""
     batches = [batch for batch, _ in batches_in(path)]
     if batches:
         return pa.Table.from_batches(batches)
-    return _schema([*COLUMNS, *(name for name in SOCIAL if METRICS[name].is_stored)]).empty_table()
+    return _schema([*COLUMNS, *(name for name in SOCIAL_METRICS if METRICS[name].is_stored)]).empty_table()
 
 
-def _message(batch: pa.RecordBatch, *, is_first: bool) -> bytes:
-    """Return a batch as it stands in a stream, the first behind the schema."""
+def _batch_bytes(batch: pa.RecordBatch, *, is_first: bool) -> bytes:
+    """Return the bytes of a batch in a stream; the first batch follows the schema."""
     header = batch.schema.serialize().to_pybytes() if is_first else b""
     message: bytes = header + batch.serialize().to_pybytes()
     return message
@@ -73,9 +73,9 @@ def _message(batch: pa.RecordBatch, *, is_first: bool) -> bytes:
 class EpisodeTable:
     """The table of episodes that is being written; a context manager, and a callback of `cprl.training`.
 
-    Episodes are safe once `add` has returned, even if the process is killed by SIGKILL; after a power failure
-    those up to the last `state_dict` are, which syncs them to the disk. After an OSError (a full disk) all
-    earlier episodes are intact, and the same `add` or `close` can be repeated.
+    Episodes survive a kill by SIGKILL once `add` has returned, and a power failure once `state_dict` has
+    returned, which syncs them to the disk. After an OSError (a full disk) all earlier episodes are intact,
+    and the same `add` or `close` can be repeated.
 
     Args:
         path: the parquet file to write, `episodes.parquet` in a run's directory, whose manifest lists it.
@@ -98,12 +98,12 @@ class EpisodeTable:
             if table.exists():
                 raise FileExistsError(f"{table} exists and is not overwritten; use another directory")
         if self.path.exists() and not self.journal.exists():
-            _reopen(self.path, self.journal)
+            _restore_journal(self.path, self.journal)
         elif not self.journal.exists():
             self._open()
 
     def _open(self, rows: int = 0) -> FileIO:
-        """Open the journal behind so many of its rows; what follows them is dropped."""
+        """Open the journal after its first `rows` rows, and drop the others."""
         count = 0
         bytes_kept = 0
         schema = None
@@ -116,10 +116,11 @@ class EpisodeTable:
         if count != rows:
             raise ValueError(f"{self.journal} holds {count} rows up to there; the checkpoint has {rows}")
         is_new = not self.journal.exists()
+        mode = "x" if is_new else "r+"
         if self._file is not None:
             self._file.close()
-        take_apart(self.journal)
-        self._file = FileIO(self.journal, "x" if is_new else "r+")  # unbuffered: it survives the process
+        break_hard_links(self.journal)
+        self._file = FileIO(self.journal, mode)  # unbuffered, so that it survives a kill
         self._file.truncate(bytes_kept)
         self._file.seek(bytes_kept)
         self._rows = count
@@ -129,28 +130,28 @@ class EpisodeTable:
         return self._file
 
     def state_dict(self) -> dict[str, int]:
-        """Return the number of rows, which are on the disk once it returns."""
+        """Sync the rows to the disk and return their number."""
         if self._file is not None:
             os.fsync(self._file.fileno())
         return {"rows": self._rows}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
-        """Continue after the given number of rows of its journal; later rows are dropped."""
+        """Continue after the given number of rows, and drop later ones."""
         self._open(int(state["rows"]))
 
     def add(self, *episodes: Episode) -> None:
         """Append episodes; the first one of a table determines the columns and metrics of all."""
         if not episodes:
             return
-        file = self._file or self._open()  # without a checkpoint of the last attempt it starts over
+        file = self._file or self._open()  # start over if there was no checkpoint
         batch = rows_of(episodes, self._schema or schema_of(episodes[0]))
         end = file.tell()
-        left = memoryview(_message(batch, is_first=self._schema is None))
+        left = memoryview(_batch_bytes(batch, is_first=self._schema is None))
         try:
             while left:
                 left = left[file.write(left) :]
         except BaseException as error:
-            file.seek(end)  # behind half of a batch later ones would be unreadable
+            file.seek(end)  # remove half a batch, after which nothing could be read
             file.truncate()
             if isinstance(error, OSError):
                 what = f"could not add episodes; the {self._rows} earlier rows are in {self.journal}"
@@ -169,13 +170,13 @@ class EpisodeTable:
         """Convert the journal to the parquet file. A second call does nothing.
 
         Raises:
-            OSError: if that fails; all episodes are in the journal, unless somebody deleted it.
+            OSError: if that fails; all episodes stay in the journal, unless it was deleted.
         """
         if self._is_closed:
             return
         (self._file or self._open()).close()
         try:
-            write_listed(self.path.parent, self.path.name, self._merge)
+            write_listed(self.path.parent, self.path.name, self._write_parquet)
         except FileNotFoundError as error:
             raise FileNotFoundError(ENOENT, f"{error.strerror}: was {self.journal} deleted?") from error
         except OSError as error:
@@ -184,7 +185,7 @@ class EpisodeTable:
         self.journal.unlink()
         self._is_closed = True
 
-    def _merge(self, target: BinaryIO) -> None:
+    def _write_parquet(self, target: BinaryIO) -> None:
         table = read_journal(self.journal)
         if table.num_rows != self._rows:
             raise OSError(
@@ -203,14 +204,17 @@ class EpisodeTable:
 
 
 def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
-    """Return the episodes of a finished, running or killed run, in the order in which they ended; of what is
-    no run they are a FileNotFoundError."""
+    """Return the episodes of a finished, running or killed run, in the order in which they ended.
+
+    Raises:
+        FileNotFoundError: if the directory is no run.
+    """
     path = Path(run_directory) / FILE_NAME
-    recipe = path.with_name(RECIPE_FILE)  # with the format of the journal, which has none of its own
+    recipe = path.with_name(RECIPE_FILE)  # it holds the format of the journal
     if recipe.is_file():
         refuse_newer(recipe, read_json(recipe), RECIPE_FORMAT)
     try:
-        # The journal first: while it exists it holds every row, and a merge does not change it.
+        # The journal comes first: while it exists it holds every row, also during a merge.
         table = read_journal(path.with_suffix(".arrows"))
     except FileNotFoundError:
         if not path.exists():
@@ -221,16 +225,16 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
 
 
 def stored_episodes(run: Path) -> Iterator[Episode]:
-    """Yield the episodes of a run in the order in which they ended, without what its table lacks: who tagged
-    whom, and what institutions counted. A run without a table has none."""
+    """Yield the episodes of a run in the order in which they ended; nothing for a run without a table. Its
+    table lacks who tagged whom, and what institutions counted."""
     try:
         table = read_episodes(run)
     except FileNotFoundError:
         return
     columns = {name: table[name].to_numpy(zero_copy_only=False) for name in table.column_names}
     columns["world"] = world_of(table)
-    metrics = metrics_in(table.schema)
-    in_force = [name for name in metrics if name.startswith(IN_FORCE)]
+    metrics = stored_metrics(table.schema)
+    in_force = [name for name in metrics if name.startswith(IN_FORCE_PREFIX)]
     agents = int(max(columns["agent"], default=0)) + 1
     for first in range(0, table.num_rows, agents):
         rows = {name: values[first : first + agents] for name, values in columns.items()}
@@ -239,47 +243,51 @@ def stored_episodes(run: Path) -> Iterator[Episode]:
             name = field.name.removesuffix("_")
             if name in rows and name in TOTALS:
                 fields_of[field.name] = rows[name] if TOTALS[name].axes == "N" else rows[name][0].item()
-        yield Episode(
-            **fields_of,
-            metrics={name: float(rows[name][0]) for name in metrics},
-            in_force=np.array([rows[name][0] for name in in_force]) if in_force else None,
-        )
+        if in_force:
+            fields_of["in_force"] = np.array([rows[name][0] for name in in_force])
+        yield Episode(**fields_of, metrics={name: float(rows[name][0]) for name in metrics})
 
 
 def read_rows(path: str | os.PathLike[str]) -> pa.Table:
-    """Read a parquet file that has the columns of a run's table, as its evaluations do; see `read_table`."""
+    """Read a parquet file with the columns of a run's table, e.g. an evaluation; see `read_table`."""
     table = read_table(path)
     _refuse_other_columns(path, table)
     return table
-
-
-_OF_ANY_SIZE: Final = (pa.types.is_floating, pa.types.is_integer)
 
 
 def _refuse_other_columns(path: str | os.PathLike[str], table: pa.Table) -> None:
     """Refuse a table whose columns are not those of episodes, e.g. one that another program wrote."""
     is_not = f"{path} is not a table of episodes: "
     names = table.column_names
-    for name in (*_NUMBERED, "return", "steps", "terminated"):
+    for name in (*_INDEX_COLUMNS, "return", "steps", "terminated"):
         if name not in names:
             raise ValueError(f"{is_not}it has no column {name}")
-    for name, kind in _KINDS.items():
+    for name, kind in _COLUMN_TYPES.items():
         if name not in names:
             continue
         if names.count(name) > 1:
             raise ValueError(f"{is_not}it has the column {name} more than once")
-        both = (table[name].type, kind)  # which may differ in size: an export has float32
-        if kind != table[name].type and not any(all(map(of, both)) for of in _OF_ANY_SIZE):
+        if not _is_same_family(table[name].type, kind):
             raise ValueError(f"{is_not}its column {name} is {table[name].type}; allowed: {kind}")
         if table[name].null_count and name != "wanted_return":
             raise ValueError(f"{is_not}its column {name} has empty places")
-    for name in _NUMBERED:
+    for name in _INDEX_COLUMNS:
         if table.num_rows and pc.min(table[name]).as_py() < 0:
             raise ValueError(f"{is_not}its column {name} has numbers below 0")
 
 
+def _is_same_family(kind: pa.DataType, other: pa.DataType) -> bool:
+    """Return whether two types are equal up to their size: exports hold float32."""
+    families = (pa.types.is_floating, pa.types.is_integer)
+    return kind == other or any(family(kind) and family(other) for family in families)
+
+
 def read_table(path: str | os.PathLike[str]) -> pa.Table:
-    """Read a parquet file of a run, checked for damage; one that is missing is a FileNotFoundError."""
+    """Read a parquet file of a run, checked for damage.
+
+    Raises:
+        FileNotFoundError: if there is none.
+    """
     path = Path(path)
     verify(path)
     try:
@@ -292,8 +300,8 @@ def read_table(path: str | os.PathLike[str]) -> pa.Table:
 
 
 EVALUATIONS: Final = "evaluation/training.parquet"
-"""The evaluations while a run was trained: the columns of `episodes.parquet`, after "trained_episodes", the
-episodes that the agents had been trained; "episode" counts those of an evaluation."""
+"""The file of evaluations during training. Its columns are "trained_episodes", the episodes of training so
+far, then those of `episodes.parquet`, where "episode" counts the episodes of an evaluation."""
 
 
 def read_evaluations(run: Path) -> pa.Table | None:
@@ -301,54 +309,56 @@ def read_evaluations(run: Path) -> pa.Table | None:
     return read_rows(run / EVALUATIONS) if (run / EVALUATIONS).exists() else None
 
 
-def _reopen(path: Path, journal: Path) -> None:
-    """Write the journal of a finished table again, a batch for each episode."""
+def _restore_journal(path: Path, journal: Path) -> None:
+    """Write the journal of a finished table again, one batch for each episode."""
     table = read_rows(path).combine_chunks()
     batches = table.to_batches(max_chunksize=max(table["agent"].to_pylist(), default=0) + 1)
-    messages = [_message(batch, is_first=place == 0) for place, batch in enumerate(batches)]
+    messages = [_batch_bytes(batch, is_first=index == 0) for index, batch in enumerate(batches)]
     write_atomically(journal, lambda file: file.writelines(messages))
 
 
-_NUMBERED: Final = ("replica", "episode", "agent")
-"""The columns that say whose a row is."""
+_INDEX_COLUMNS: Final = ("replica", "episode", "agent")
+"""The columns that identify a row."""
 
-_OF_TOTALS: Final = {name: total for name, total in TOTALS.items() if total.column is not None}
+_STORED_TOTALS: Final = {name: total for name, total in TOTALS.items() if total.column is not None}
 COLUMNS: Final = {
     **dict.fromkeys(("replica", "world", "episode", "agent"), pa.int32()),
-    **{name: total.column for name, total in _OF_TOTALS.items() if not total.is_of_institutions},
+    **{name: total.column for name, total in _STORED_TOTALS.items() if not total.is_of_institutions},
 }
-"""The columns of a table, as in `Episode`; those of `OF_INSTITUTIONS` and the metrics follow, float64, NaN
-where undefined.
+"""The columns of a table, as in `Episode`; those of `INSTITUTION_COLUMNS` and the metrics follow, float64,
+NaN where undefined.
 
 Values of the whole episode are repeated in the row of each agent. Values that the game does not report have
-no column; nor have, outside of a training, the world, which counts through those of all replicas, and the
-wanted return. It is null for agents that do not learn."""
-OF_INSTITUTIONS: Final = {name: one.column for name, one in _OF_TOTALS.items() if one.is_of_institutions}
-"""The columns of a game with institutions; those of counts only where
-`cprl.measuring.registry.counts_for` has them."""
+no column. Outside of a training there are no columns "world", which numbers the worlds of all replicas, and
+"wanted_return", which is null for agents that do not learn."""
+INSTITUTION_COLUMNS: Final = {
+    name: total.column for name, total in _STORED_TOTALS.items() if total.is_of_institutions
+}
+"""The columns of games with institutions; a count has one only where `cprl.measuring.registry.counts_for`
+lists it."""
 
 
-_KINDS: Final = {**COLUMNS, **OF_INSTITUTIONS}
+_COLUMN_TYPES: Final = {**COLUMNS, **INSTITUTION_COLUMNS}
 
 LEFT_OUT: Final = b"left_out"
-"""The key of the schema's metadata whose value says which columns are left out, and why, if any are."""
+"""The key of the schema's metadata that says which columns are left out, and why."""
 
 
 def _schema(names: Iterable[str]) -> pa.Schema:
-    return pa.schema({name: _KINDS.get(name, pa.float64()) for name in names})
+    return pa.schema({name: _COLUMN_TYPES.get(name, pa.float64()) for name in names})
 
 
 def schema_of(episode: Episode) -> pa.Schema:
-    """Return the columns that an episode has; the schema's metadata names those that it lacks."""
+    """Return the schema of an episode's columns; its metadata names missing columns."""
     schema = _schema(_columns(episode))
-    missing = left_out(episode.reported)
+    missing = left_out_note(episode.reported)
     return schema.with_metadata({LEFT_OUT: missing}) if missing else schema
 
 
 def rows_of(episodes: Sequence[Episode], schema: pa.Schema) -> pa.RecordBatch:
     """Return a row for each episode and agent, with the schema of the table's first episode."""
-    parts = list(map(_columns, episodes))
-    for columns in parts:
+    columns_of_episodes = list(map(_columns, episodes))
+    for columns in columns_of_episodes:
         if columns.keys() != set(schema.names):
             more = columns.keys() - set(schema.names)
             lacks = set(schema.names) - columns.keys()
@@ -356,14 +366,11 @@ def rows_of(episodes: Sequence[Episode], schema: pa.Schema) -> pa.RecordBatch:
                 f"the episode has the extra columns {sorted(more)} and lacks {sorted(lacks)}; allowed: the "
                 "columns of the table's first episode"
             )
-    arrays = [
-        pa.array(
-            np.concatenate([columns[field.name] for columns in parts]),
-            field.type,
-            from_pandas=field.name == "wanted_return",  # NaN, of agents that do not learn, is null
-        )
-        for field in schema
-    ]
+    arrays = []
+    for field in schema:
+        values = np.concatenate([columns[field.name] for columns in columns_of_episodes])
+        is_nan_null = field.name == "wanted_return"  # for agents that do not learn
+        arrays.append(pa.array(values, field.type, from_pandas=is_nan_null))
     return pa.record_batch(arrays, schema=schema)
 
 
@@ -371,26 +378,30 @@ def _columns(episode: Episode) -> dict[str, Any]:
     """Return the columns of an episode in order, [N] each."""
     agents = np.arange(len(episode.return_))
     entries = {**(episode.counts or {}), **vars(episode), "agent": agents, "return": episode.return_}
-    if episode.wanted_return is None:  # no training, of whose worlds it is one
+    if episode.wanted_return is None:  # outside of a training
         del entries["world"]
-    columns = {name: entries[name] for name in _KINDS if entries.get(name) is not None}
+    columns = {name: entries[name] for name in _COLUMN_TYPES if entries.get(name) is not None}
     columns = {**columns, **episode.metrics, **columns}
     return {name: np.broadcast_to(values, agents.shape) for name, values in columns.items()}
 
 
 def table_of(episodes: Sequence[Episode], replicas: Sequence[int] = (0,)) -> pa.Table:
-    """Return episodes outside of a training as a table, as many of each replica in turn, numbered from 0."""
-    each = len(episodes) // len(replicas)
+    """Return episodes outside of a training as a table: equally many of each replica in turn, numbered from
+    0."""
+    count = len(episodes) // len(replicas)
     numbered = [
-        replace(episode, replica=replicas[place // each], episode=place % each)
-        for place, episode in enumerate(episodes)
+        replace(episode, replica=replicas[index // count], episode=index % count)
+        for index, episode in enumerate(episodes)
     ]
     return pa.Table.from_batches([rows_of(numbered, schema_of(episodes[0]))])
 
 
 def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:
-    """Write a parquet file atomically, in little room; one that exists is refused by a FileExistsError, or
-    replaced."""
+    """Write a small parquet file atomically.
+
+    Args:
+        over: whether an existing file is replaced; else it raises a FileExistsError.
+    """
     if not over:
         refuse_to_write_over(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -398,21 +409,21 @@ def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:
 
 
 def write_small(table: pa.Table, file: BinaryIO) -> None:
-    """Write a table as parquet in little room: each column by dictionary, split into bytes, or as it is,
+    """Write a table as a small parquet file: each column as a dictionary, split into bytes, or plain,
     whichever is smallest."""
     encodings: dict[str, list[str]] = {"use_dictionary": [], "use_byte_stream_split": []}
     for field in table.schema:
         choices: list[dict[str, bool]] = [{"use_dictionary": True}, {"use_dictionary": False}]
         if pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
             choices.append({"use_dictionary": False, "use_byte_stream_split": True})
-        best = min(choices, key=partial(_size, table.select([field.name])))
+        best = min(choices, key=partial(_compressed_size, table.select([field.name])))
         for encoding, columns in encodings.items():
             if best.get(encoding):
                 columns.append(field.name)
     pq.write_table(table, file, compression="zstd", compression_level=19, **encodings)
 
 
-def _size(column: pa.Table, encoding: Mapping[str, bool]) -> int:
+def _compressed_size(column: pa.Table, encoding: Mapping[str, bool]) -> int:
     file = BytesIO()
-    pq.write_table(column, file, compression="zstd", compression_level=3, **encoding)  # which is quick
+    pq.write_table(column, file, compression="zstd", compression_level=3, **encoding)  # a quick estimate
     return file.tell()

@@ -1,4 +1,4 @@
-"""Files of a run: complete or absent, checked for damage, in a directory that one process writes.
+"""Write and read the files of a run: atomically, with checksums, under a lock on the directory.
 
 A file is written under another name, synced and renamed. Weights, tables and checkpoints have a checksum,
 which `verify` compares whenever one is read: a checkpoint in its name, all others in `manifest.json`.
@@ -24,47 +24,47 @@ from typing import Any, BinaryIO, Final, Self
 
 from cprl.runs.length import without_length
 from cprl.system.output import legible
-from cprl.values import refuse_other_keys, shown
+from cprl.values import refuse_other_keys, short_repr
 
 try:
     import fcntl
-except ImportError:  # Windows has no flock; runs are not locked there
+except ImportError:  # Windows, where runs are not locked
     fcntl = None  # type: ignore[assignment]
 
 RECIPE_FILE: Final = "recipe.json"
 REPORT: Final = "report.json"
-"""Written when everything of a run is finished."""
+"""The file that is written when a run is finished."""
 RECIPE_FORMAT: Final = 2
-"""Of `recipe.json`, and of the journal and `report.json` beside it."""
+"""The format of `recipe.json`, and of the journal and `report.json` beside it."""
 MANIFEST_FORMAT: Final = 1
-"""Of `manifest.json`, and of what it lists: weights, tables, transforms, decisions."""
+"""The format of `manifest.json`, and of what it lists: weights, tables, transforms, decisions."""
 TRAINING_STATE_FORMAT: Final = 8
-"""Of checkpoints."""
+"""The format of checkpoints."""
 STUDY_FORMAT: Final = 1
-"""Of `study.json`."""
+"""The format of `study.json`."""
 STUDY_TABLE_FORMAT: Final = 2
-"""Of the table of a study."""
+"""The format of the table of a study."""
 
 _MOST_NESTED: Final = 128
-"""How deep a JSON file may be nested: what a `Custom` may be, and as much around it."""
-_PARTIAL: Final = f"*.{8 * '[0-9a-f]'}.partial"
+"""The most levels that a JSON file may nest: those of a `Custom`, and as many around it."""
+_PARTIAL_PATTERN: Final = f"*.{8 * '[0-9a-f]'}.partial"
 """The names of files that are being written, or whose writing was interrupted."""
 
 
 def refuse_to_write_over(path: Path) -> None:
-    """Refuse a file that exists by a FileExistsError, before hours of work."""
-    if os.path.lexists(path):  # a link to a file that is not there would be written through
+    """Raise a FileExistsError for a file that exists, before hours of work."""
+    if os.path.lexists(path):  # also a dangling link, through which a file would be written
         raise FileExistsError(f"{path} exists and is not overwritten; use another name")
 
 
 def write_atomically(
     path: Path, write: Callable[[BinaryIO], object], *, name: Callable[[Path], str] | None = None
 ) -> Path:
-    """Write a temporary file, whose name has letters of its own, sync it to disk and rename it; a file that
-    is there is replaced.
+    """Write a temporary file of a unique name, sync it to the disk and rename it; an existing file is
+    replaced.
 
     Args:
-        name: returns the final name, given the complete temporary file, where it depends on the content.
+        name: returns the final name for the complete temporary file, if it depends on the content.
     """
     partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}.partial")
     try:
@@ -84,16 +84,16 @@ def write_atomically(
     return path
 
 
-def take_apart(path: Path) -> None:
-    """Replace a file that has another name too, a hard link as some backups make, by a copy: what is written
-    into it in place would else be written there."""
+def break_hard_links(path: Path) -> None:
+    """Replace a file with several hard links, as some backups make, by a copy, so that writing in place does
+    not change the others."""
     if path.is_file() and path.stat().st_nlink > 1:
         with open(path, "rb") as source:
             write_atomically(path, lambda file: copyfileobj(source, file))
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync a folder, so that a new name in it survives a power failure, if the system supports it."""
+    """Sync a folder, if the system supports it, so that new names in it survive a power failure."""
     if sys.platform == "win32":
         return
     file = os.open(folder, os.O_RDONLY)
@@ -104,9 +104,9 @@ def sync_folder(folder: Path) -> None:
 
 
 def remove_partial(*folders: Path) -> None:
-    """Remove the temporary files that killed processes left in folders, where nobody else writes now."""
+    """Remove the temporary files of killed processes from folders that nobody else writes."""
     for folder in folders:
-        for path in folder.glob(_PARTIAL):
+        for path in folder.glob(_PARTIAL_PATTERN):
             path.unlink(missing_ok=True)
 
 
@@ -117,8 +117,13 @@ def write_json(path: Path, value: object) -> None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; a file that is missing is a FileNotFoundError, all else a ValueError."""
-    refuse_special(path)
+    """Read a JSON object.
+
+    Raises:
+        FileNotFoundError: if the file is missing.
+        ValueError: for any other content.
+    """
+    refuse_no_file(path)
     try:
         value = json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
@@ -132,88 +137,99 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
-def refuse_special(path: Path) -> None:
-    """Refuse a directory, and a pipe, which would wait for somebody to write into it."""
+def refuse_no_file(path: Path) -> None:
+    """Refuse a directory or a pipe, which would block the reader."""
     if path.exists() and not path.is_file():
         raise ValueError(f"{path} is not a file")
 
 
-_APART: Final = ("runs", "runs-earlier")
-"""Folders of a study that may be links, as to another disk: each run in them is looked at by itself."""
-_OF_OTHERS: Final = ("wandb",)
+_SEPARATE_FOLDERS: Final = ("runs", "runs-earlier")
+"""Folders of a study that may be links, e.g. to another disk; each run in them is checked by itself."""
+_LOGGER_FOLDERS: Final = ("wandb",)
 """Folders in which a logger keeps links of its own."""
 
 
 def refuse_links(folder: Path) -> None:
-    """Refuse the directory of a run or study if a symbolic link leads out of it, to what would be written.
+    """Refuse the directory of a run or study if a symbolic link in it leads out, where files would be
+    overwritten.
 
     The directory itself may be reached through a link.
     """
-    place = Path(os.path.realpath(folder))
+    real_folder = Path(os.path.realpath(folder))
     for parent, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if name not in _APART]
+        folders[:] = [name for name in folders if name not in _SEPARATE_FOLDERS]
         for path in (Path(parent, name) for name in (*folders, *names)):
-            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(place):
+            if path.is_symlink() and not Path(os.path.realpath(path)).is_relative_to(real_folder):
                 raise ValueError(
                     f"{path} is a symbolic link out of {folder}, where nothing is written; replace it by a "
                     "copy, or remove it"
                 )
-        folders[:] = [name for name in folders if name not in _OF_OTHERS]
+        folders[:] = [name for name in folders if name not in _LOGGER_FOLDERS]
 
 
 def written_by_another(recipe: object) -> str:
-    """Return the end of a message about a recipe that cannot be read: which cprl wrote it, where that was
-    another than this; else nothing."""
+    """Return the end of a message about an unreadable recipe, which names the version of cprl that wrote it;
+    "" if it is this version."""
     versions = recipe.get("versions") if isinstance(recipe, Mapping) else None
     wrote = versions.get("cprl") if isinstance(versions, Mapping) else None
     here = version("cprl")
-    return f"; cprl {shown(wrote)} wrote it, and this is {here}" if wrote not in (None, here) else ""
+    return f"; cprl {short_repr(wrote)} wrote it, and this is {here}" if wrote not in (None, here) else ""
 
 
 def refuse_newer(what: object, table: Mapping[str, Any], newest: int) -> None:
-    """Refuse what a newer cprl wrote than one that reads formats up to `newest`; any other format is left to
-    the reader."""
+    """Refuse content in a format above `newest`, which a newer cprl wrote; other formats are left to the
+    reader."""
     number = table.get("format")
     if isinstance(number, int) and number > newest:
         raise ValueError(
-            f"{what} has the format {shown(number)}, and cprl {version('cprl')} reads up to {newest}: a "
+            f"{what} has the format {short_repr(number)}, and cprl {version('cprl')} reads up to {newest}: a "
             "newer cprl wrote it; upgrade cprl"
         )
 
 
-FREE: Final = {"name": "", "on_nan": ""}
-"""In place of what may differ in the experiments of one and the same run, beside their length."""
+NEUTRAL_FIELDS: Final = {"name": "", "on_nan": ""}
+"""Fields of an experiment, beside its length, that may change for the same run, with neutral values."""
 
 MANIFEST_FILE: Final = "manifest.json"
 _NAMED_CHECKSUM: Final = re.compile(r"-([0-9a-f]{32})\.pt")
 
 
 def checksum(path: Path) -> str:
-    """Return BLAKE2b of a file's content, 16 bytes in hexadecimal."""
+    """Return the BLAKE2b checksum of a file, 16 bytes in hexadecimal."""
     with open(path, "rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
 def digest_of(text: str, *, size: int = 16) -> str:
-    """Return BLAKE2b of a text, so many bytes in hexadecimal."""
+    """Return the BLAKE2b checksum of a text, `size` bytes in hexadecimal."""
     return hashlib.blake2b(text.encode(), digest_size=size).hexdigest()
 
 
 def verify(path: Path) -> None:
-    """Refuse a file that is not the one that was written, by the checksum in its name or in the manifest of
-    its run; a file without a checksum is not checked."""
-    refuse_special(path)
-    named = _NAMED_CHECKSUM.search(path.name)
-    runs = [run for run in (path.parent, path.parent.parent) if (run / MANIFEST_FILE).exists()]
-    listed = _sound(runs[0]).get(path.relative_to(runs[0]).as_posix()) if runs and not named else None
-    expected = named[1] if named else listed
-    if expected is not None and (actual := checksum(path)) != expected:
+    """Refuse a file whose content does not match the checksum in its name or in its run's manifest; a file
+    without a checksum is not checked."""
+    refuse_no_file(path)
+    expected = _expected_checksum(path)
+    if expected is None:
+        return
+    actual = checksum(path)
+    if actual != expected:
         raise ValueError(f"{path} is damaged or was changed: its checksum is {actual}, not {expected}")
 
 
+def _expected_checksum(path: Path) -> str | None:
+    in_name = _NAMED_CHECKSUM.search(path.name)
+    if in_name:
+        return in_name[1]
+    for run in (path.parent, path.parent.parent):
+        if (run / MANIFEST_FILE).exists():
+            return _checksums(run).get(path.relative_to(run).as_posix())
+    return None
+
+
 def refuse_missing(run: Path) -> None:
-    """Refuse a run that lacks a file that its manifest lists; each is named."""
-    missing = [legible(name) for name in _sound(run) if not (run / name).exists()]
+    """Refuse a run that lacks files of its manifest; name them."""
+    missing = [legible(name) for name in _checksums(run) if not (run / name).exists()]
     if missing:
         raise ValueError(
             f"{run} lacks {', '.join(missing)}, which its {MANIFEST_FILE} lists; restore it, or take "
@@ -225,25 +241,25 @@ def write_listed(run: Path, name: str, write: Callable[[BinaryIO], object]) -> N
     """Write a file of a run atomically, and its checksum into the manifest.
 
     Args:
-        name: the file's path in the run, e.g. "checkpoints/final.pt"; its folder is made.
+        name: the file's path in the run, e.g. "checkpoints/final.pt"; its folder is created.
     """
     path = run / name
-    _list(run, {name: None})
-    if path.parent != run:  # a run that was deleted is not made again
+    _update_manifest(run, {name: None})
+    if path.parent != run:  # do not recreate a deleted run
         path.parent.mkdir(exist_ok=True)
     write_atomically(path, write)
-    _list(run, {name: checksum(path)})
+    _update_manifest(run, {name: checksum(path)})
 
 
 def remove_listed(run: Path, name: str) -> None:
-    """Remove a file of a run, if it is there, and its checksum from the manifest."""
-    _list(run, {name: None})
+    """Remove a file of a run, if it exists, and its checksum from the manifest."""
+    _update_manifest(run, {name: None})
     (run / name).unlink(missing_ok=True)
 
 
 def rename_listed(run: Path, name: str, new: str) -> None:
-    """Rename a file or folder of a run; checksums stay with their files. What has the new name is replaced,
-    but for a folder, whose files are."""
+    """Rename a file or folder of a run, with its checksums. An existing file of the new name is replaced; an
+    existing folder is merged."""
     source = run / name
     target = run / new
     if source.is_dir():
@@ -252,16 +268,16 @@ def rename_listed(run: Path, name: str, new: str) -> None:
             rename_listed(run, f"{name}/{path.name}", f"{new}/{path.name}")
         source.rmdir()
         return
-    listed = _manifest(run)["files"].get(name)
-    _list(run, {name: None, new: None})
+    listed = _read_manifest(run)["files"].get(name)
+    _update_manifest(run, {name: None, new: None})
     source.replace(target)
-    _list(run, {new: listed})
+    _update_manifest(run, {new: listed})
 
 
-def _list(run: Path, changes: Mapping[str, str | None]) -> None:
-    """Write new checksums of files into the manifest; None for a file that is about to be replaced, since a
-    kill before its new checksum must not leave that of another content."""
-    before = _manifest(run)["files"]
+def _update_manifest(run: Path, changes: Mapping[str, str | None]) -> None:
+    """Update checksums in the manifest. None removes the checksum of a file that is about to change, so that
+    no outdated one remains if the process is killed."""
+    before = _read_manifest(run)["files"]
     files = {name: digest for name, digest in sorted({**before, **changes}.items()) if digest is not None}
     if files != before:
         table = {"format": MANIFEST_FORMAT, "checksum": "blake2b, 16 bytes"}
@@ -271,20 +287,20 @@ def _list(run: Path, changes: Mapping[str, str | None]) -> None:
 
 
 def _experiment_in(run: Path) -> str | None:
-    """Return the checksum of the experiment in the recipe of a run, whatever its name and length; None where
-    there is none."""
+    """Return the checksum of the experiment in a run's recipe, without its name and length; None without a
+    recipe."""
     try:
         experiment = read_json(run / RECIPE_FILE).get("experiment")
     except FileNotFoundError:
         return None
     if not isinstance(experiment, dict):
         return None
-    return digest_of(json.dumps(without_length({**experiment, **FREE}), sort_keys=True))
+    return digest_of(json.dumps(without_length({**experiment, **NEUTRAL_FIELDS}), sort_keys=True))
 
 
-def _sound(run: Path) -> dict[str, str]:
-    """Return the checksums of the files of a run, beside the recipe of the run that wrote them."""
-    table = _manifest(run)
+def _checksums(run: Path) -> dict[str, str]:
+    """Return the checksums in a run's manifest by file; refuse a manifest of another experiment."""
+    table = _read_manifest(run)
     wrote = table.get("experiment")
     experiment = _experiment_in(run)
     if None not in (wrote, experiment) and wrote != experiment:
@@ -297,8 +313,8 @@ def _sound(run: Path) -> dict[str, str]:
     return files
 
 
-def _manifest(run: Path) -> dict[str, Any]:
-    """Read the manifest of a run; one that is not there lists nothing."""
+def _read_manifest(run: Path) -> dict[str, Any]:
+    """Read the manifest of a run; a missing one lists no files."""
     path = run / MANIFEST_FILE
     try:
         table = read_json(path)
@@ -315,24 +331,25 @@ LOCK_FILE: Final = "run.lock"
 
 
 class RunLockedError(ValueError):
-    """Another process writes the directory, or may do so; the message names it."""
+    """Another process writes the directory, or may do so; the message names the process."""
 
 
 class RunLock:
-    """The lock of a run's directory, or shares that of a study's; a context manager.
+    """The exclusive lock of a run's directory, or a share of the lock of a study's; a context manager.
 
     The lock is a `flock` on `run.lock`, which the system releases when the process dies, however it dies. The
     file names host, process and start time. Where a file system is shared by several hosts a `flock` may not
     reach the others, so the lock file of another host is refused too, unless it is taken over. Whoever leaves
-    last removes the file. On Windows, which has no `flock`, nothing is locked.
+    last removes the file. On Windows, which has no `flock`, nothing is locked. The package filelock does
+    without what a study needs: a lock on a file that several processes hold together.
 
     Args:
-        take_over: whether to take the lock of a run that a process on another host left behind. A lock that a
-            living process on this host holds is never taken.
-        study: tells a study from others: its directory is locked together with all who run the same one.
+        take_over: whether to take a lock that a process on another host left behind. The lock of a living
+            process on this host is never taken.
+        study: the checksum of a study; processes with the same one share the lock.
 
     Raises:
-        RunLockedError: names the process that holds the lock.
+        RunLockedError: if another process holds the lock; the message names it.
     """
 
     def __init__(self, directory: Path, *, take_over: bool = False, study: str | None = None) -> None:
@@ -342,7 +359,7 @@ class RunLock:
         self._study = study
         self._file: int | None = None
         self.is_alone = True
-        """Whether nobody else is known to have run the study when it was locked."""
+        """True if nobody else is known to have run the study when it was locked."""
 
     def __enter__(self) -> Self:
         refuse_links(self.directory)
@@ -350,61 +367,63 @@ class RunLock:
             file = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o666)
             with ExitStack() as closing:
                 closing.callback(os.close, file)
-                self._lock(file)
-                if self._is_in_place(file):  # else once more: its holder ended in the meantime
-                    holder = _holder(file)
-                    if self._study is not None and holder.get("study") != self._study:
-                        raise RunLockedError(
-                            f"{self.directory} is run as another study by {_named(holder)}; wait until it "
-                            "ends, or take another directory; if it ended with its machine, delete "
-                            f"{self.path}"
-                        )
+                self._acquire(file)
+                if self._is_in_place(file):  # else try again: its holder has ended and removed it
+                    self._refuse_other_study(_read_holder(file))
                     closing.pop_all()
                     self._file = file
         return self
 
-    def _lock(self, file: int) -> None:
+    def _refuse_other_study(self, holder: Mapping[str, Any]) -> None:
+        if self._study is not None and holder.get("study") != self._study:
+            raise RunLockedError(
+                f"{self.directory} is run as another study by {_describe_holder(holder)}; wait until it "
+                f"ends, or take another directory; if it ended with its machine, delete {self.path}"
+            )
+
+    def _acquire(self, file: int) -> None:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             if self._study is None:
+                holder = _describe_holder(_read_holder(file))
                 raise RunLockedError(
-                    f"{self.directory} is being written by {_named(_holder(file))}; wait until it ends, or "
-                    "stop it"
+                    f"{self.directory} is being written by {holder}; wait until it ends, or stop it"
                 ) from None
             self.is_alone = False
         else:
-            holder = _holder(file)
+            last = _read_holder(file)
             here = socket.gethostname()
-            # A process on another host may hold it, as far as the file says.
-            self.is_alone = holder.get("host") in (None, here) or self._take_over
+            # By its content, a process on another host may still hold it.
+            self.is_alone = last.get("host") in (None, here) or self._take_over
             if self.is_alone:
-                self._sign(file)
+                self._write_holder(file)
             elif self._study is None:
                 raise RunLockedError(
-                    f"{self.directory} is locked by {_named(holder)}, on another host than this, {here}; if "
-                    "that process has ended: --take-over (in Python take_over=True)"
+                    f"{self.directory} is locked by {_describe_holder(last)}, on another host than this, "
+                    f"{here}; if that process has ended: --take-over (in Python take_over=True)"
                 )
         if self._study is not None:
-            fcntl.flock(file, fcntl.LOCK_SH)  # whoever else had it exclusively had it for this moment
+            fcntl.flock(file, fcntl.LOCK_SH)  # an exclusive lock by others lasts only this moment
 
-    def _sign(self, file: int) -> None:
+    def _write_holder(self, file: int) -> None:
         started = datetime.now().astimezone().isoformat(timespec="seconds")
         holder = {"host": socket.gethostname(), "pid": os.getpid(), "started": started}
         holder |= {} if self._study is None else {"study": self._study}
         if os.fstat(file).st_nlink > 1 and self._is_in_place(file):
-            self.path.unlink()  # a hard link, through which nothing is written; the next one is a new file
+            self.path.unlink()  # do not write through a hard link; the next attempt makes a new file
             return
         try:
             os.ftruncate(file, 0)
             os.pwrite(file, (json.dumps(holder) + "\n").encode(), 0)
-        except OSError as error:  # e.g. of a full disk
+        except OSError as error:  # e.g. a full disk
             if self._is_in_place(file):
                 self.path.unlink()
             raise OSError(error.errno, error.strerror, str(self.path)) from error
 
     def _is_in_place(self, file: int) -> bool:
-        """Return whether the file is the one in the directory: its holder removes it at the end."""
+        """Return whether the file is still the one in the directory, since its holder removes it at the
+        end."""
         try:
             return os.path.samestat(os.fstat(file), os.stat(self.path))
         except FileNotFoundError:
@@ -413,24 +432,24 @@ class RunLock:
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
         if self._file is None:
             return
-        with suppress(OSError):  # BlockingIOError: it is left to those who still run the study
+        with suppress(OSError):  # BlockingIOError if others still run the study
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            # Not that of another host, nor where the directory was deleted and made again.
-            if _holder(self._file).get("host") == socket.gethostname() and self._is_in_place(self._file):
+            # Keep the file of another host, and one in a new directory of the same name.
+            if _read_holder(self._file).get("host") == socket.gethostname() and self._is_in_place(self._file):
                 self.path.unlink()
         os.close(self._file)
         self._file = None
 
 
 def holder_of(directory: Path) -> str:
-    """Return who holds the lock of a directory, as messages name a process."""
+    """Return in words which process holds the lock of a directory."""
     with suppress(OSError), open(directory / LOCK_FILE, "rb") as file:
-        return _named(_holder(file.fileno()))
-    return _named({})
+        return _describe_holder(_read_holder(file.fileno()))
+    return _describe_holder({})
 
 
-def _holder(file: int) -> dict[str, Any]:
-    """Return who wrote the lock file; empty if it cannot be read, e.g. as its process is just starting."""
+def _read_holder(file: int) -> dict[str, Any]:
+    """Return the content of the lock file; empty if it cannot be read, e.g. while its process is starting."""
     try:
         holder = json.loads(os.pread(file, 4096, 0))
     except (ValueError, RecursionError):
@@ -438,7 +457,7 @@ def _holder(file: int) -> dict[str, Any]:
     return holder if isinstance(holder, dict) else {}
 
 
-def _named(holder: Mapping[str, Any]) -> str:
+def _describe_holder(holder: Mapping[str, Any]) -> str:
     if not holder:
         return "another process"
     return f"process {holder.get('pid')} on {holder.get('host')} since {holder.get('started')}"

@@ -1,4 +1,4 @@
-"""How long each replica is trained: so many episodes, or so many steps."""
+"""Length: for how many episodes or steps each replica is trained."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,18 +7,17 @@ from typing import Any, Final, Literal, Self
 
 Unit = Literal["episodes", "steps"]
 UNITS: Final[tuple[Unit, ...]] = ("episodes", "steps")
-"""The fields of an experiment, one of which says its length; and flags of the command line."""
+"""The two fields of an experiment of which one is its length; also flags of the command line."""
 
 
 @dataclass(frozen=True)
 class Length:
-    """How long each replica is trained.
+    """The length of the training of each replica.
 
     Args:
-        number: how many episodes each replica plays, or how many steps it takes; a turn of W worlds is W
-            steps.
-        unit: which of the two.
-        clock: the steps of an episode at most; None in a game without a clock.
+        number: the episodes or steps of each replica; a turn of W worlds is W steps.
+        unit: whether `number` counts episodes or steps.
+        clock: the most steps of an episode; None in a game without a clock.
     """
 
     number: int
@@ -27,17 +26,19 @@ class Length:
 
     @classmethod
     def of(cls, config: Mapping[str, Any], clock: int | None = None) -> Self:
-        """Return the length in the table of an experiment; 0 where a damaged one has no number."""
+        """Return the length in the table of an experiment; 0 if a damaged table has no number."""
         unit: Unit = "episodes" if config.get("steps") is None else "steps"
         number = config.get(unit)
-        return cls(number if isinstance(number, int) else 0, unit, clock)
+        if not isinstance(number, int):
+            number = 0
+        return cls(number, unit, clock)
 
     def __str__(self) -> str:
         return f"{self.number:,} {self.unit}"
 
     @property
     def flag(self) -> str:
-        """The flag of the command line that says it."""
+        """Return the flag of the command line that sets it."""
         return f"--{self.unit}"
 
     @property
@@ -46,23 +47,24 @@ class Length:
 
     @property
     def episodes(self) -> int:
-        """The episodes of each replica that are expected: of so many steps, as many as these are where each
-        lasts as long as the clock lets it, and 1 in a game without a clock."""
+        """Return the expected episodes of each replica: a length in steps is divided by the clock, and is 1
+        episode in a game without a clock."""
         return ceil(self.number / (self.clock or self.number)) if self.is_of_steps else self.number
 
     def reached(self, *, episodes: float, steps: float) -> float:
-        """Return how far a replica with so many episodes and steps is, in its unit; at most its number."""
-        return min(self.number, steps if self.is_of_steps else episodes)
+        """Return the progress of a replica after so many episodes and steps, in `unit`, at most `number`."""
+        count = steps if self.is_of_steps else episodes
+        return min(self.number, count)
 
     def is_over(self, *, episodes: int, steps: int) -> bool:
-        """Return whether a replica with so many episodes and steps has reached it."""
+        """Return whether a replica has reached the length after so many episodes and steps."""
         return self.reached(episodes=episodes, steps=steps) == self.number
 
     def is_shorter_than(self, other: "Length") -> bool:
-        """Return whether it can be extended to another length, of the same unit."""
+        """Return whether it can be extended to another length in the same unit."""
         return self.unit == other.unit and 0 < self.number < other.number
 
 
 def without_length(config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the table of an experiment without its length, to be compared with others."""
+    """Return the table of an experiment without its length, for comparison."""
     return {**config, **dict.fromkeys(UNITS)}

@@ -1,4 +1,4 @@
-"""LoggerCallback: writes the metrics of each episode to a TorchRL logger, e.g. TensorBoard or W&B."""
+"""Log the metrics of each episode to a TorchRL logger, e.g. TensorBoard or W&B."""
 
 import uuid
 from collections.abc import Mapping
@@ -9,12 +9,12 @@ from typing import Any, Final, Self
 
 from torchrl.record.loggers import CSVLogger, Logger, get_logger
 
-from cprl.measuring.series import OF_GROUP, mean_of
-from cprl.values.arrays import Float64
+from cprl.measuring.series import GROUP_PREFIXES, mean_of
+from cprl.values.array_types import Float64
 
-PACKAGES: Final = ("tensorboard", "wandb")
-"""The loggers that have a name, which is that of the package that each needs."""
-FOLDER: Final = "logs"
+LOGGER_PACKAGES: Final = ("tensorboard", "wandb")
+"""The loggers that can be named, each by the package that it needs."""
+LOGS: Final = "logs"
 """The folder of named loggers in the run's directory."""
 
 
@@ -22,12 +22,12 @@ def check_logger(logger: object) -> None:
     """Check the name of a logger before anything is written.
 
     Args:
-        logger: a name in `PACKAGES`; other objects are not checked.
+        logger: a name in `LOGGER_PACKAGES`; other objects are not checked.
     """
     if not isinstance(logger, str):
         return
-    if logger not in PACKAGES:
-        names = ", ".join(f'"{name}"' for name in PACKAGES)
+    if logger not in LOGGER_PACKAGES:
+        names = ", ".join(f'"{name}"' for name in LOGGER_PACKAGES)
         raise ValueError(f"logger is {logger!r}; allowed: {names}, or a TorchRL logger")
     if find_spec(logger) is None:
         raise ModuleNotFoundError(
@@ -43,20 +43,20 @@ def make_logger(logger: str | Logger, run: str | Path) -> Logger:
     the project and whether W&B is online.
 
     Args:
-        logger: one of `PACKAGES`, or a logger.
+        logger: one of `LOGGER_PACKAGES`, or a logger.
     """
     if not isinstance(logger, str):
         return logger
     check_logger(logger)
-    folder = Path(run) / FOLDER
+    folder = Path(run) / LOGS
     folder.mkdir(parents=True, exist_ok=True)
     name = logger
     options = dict[str, Any]()
     if logger == "wandb":
         name = Path(run).resolve().name
         options = {"wandb_kwargs": {"id": _wandb_id(folder)}}
-    made: Logger = get_logger(logger, str(folder), name, **options)
-    return made
+    named: Logger = get_logger(logger, str(folder), name, **options)
+    return named
 
 
 def _wandb_id(folder: Path) -> str:
@@ -67,7 +67,7 @@ def _wandb_id(folder: Path) -> str:
 
 
 def _last_step_in(logger: Logger, name: str) -> int:
-    """Return the last step that the file of a CSVLogger has of a number; -1 if none, or of another logger."""
+    """Return the last step of a number in the file of a CSVLogger; -1 without one, and for other loggers."""
     if not isinstance(logger, CSVLogger):
         return -1
     path = Path(logger.experiment.log_dir, "scalars", f"{name}.csv")
@@ -77,10 +77,10 @@ def _last_step_in(logger: Logger, name: str) -> int:
 
 
 class LoggerCallback:
-    """Writes the numbers of each episode to a TorchRL logger, by the names of docs/metrics.md.
+    """A callback of `cprl.training` that writes the numbers of each episode to a TorchRL logger.
 
-    A callback of `cprl.training`, and a context manager. The step of every number is the episode, counted
-    from 0; of replicas in W worlds every W episodes are written together. An episode is written once all
+    It is a context manager, and uses the names of docs/metrics.md. The step of every number is the episode,
+    counted from 0; with W worlds, every W episodes are written together. An episode is written once all
     replicas have ended it: the mean over replicas as `social/equality`, and with several replicas the metrics
     and returns of each as `replica_0/social/equality`. Undefined values are not written, nor metrics that the
     game does not report.
@@ -104,16 +104,15 @@ class LoggerCallback:
         self.logger = logger
         self._resumes = resumes
         self._last: dict[str, int] = {}
-        """The last step that the logger has of each number, where it resumes."""
+        """The last logged step of each number, if it resumes."""
 
     def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
         """Write the numbers of an episode that all replicas have ended."""
         written = {name: mean_of(values) for name, values in numbers.items()}
         for name, values in numbers.items():
-            if len(values) > 1 and (name.startswith(OF_GROUP) or name.endswith("/return")):
-                written |= {
-                    f"replica_{replica}/{name}": value for replica, value in enumerate(values.tolist())
-                }
+            if len(values) > 1 and (name.startswith(GROUP_PREFIXES) or name.endswith("/return")):
+                for replica, value in enumerate(values.tolist()):
+                    written[f"replica_{replica}/{name}"] = value
         defined = {name: value for name, value in written.items() if not isnan(value)}
         if self._resumes:
             defined = {name: value for name, value in defined.items() if episode > self._last_step(name)}

@@ -1,5 +1,5 @@
-"""The directory of a run; its `recipe.json` holds the experiment, versions, start time, git commit and
-the type of processor."""
+"""The directory of a run and its `recipe.json`: experiment, versions, start time, git commit and
+processor."""
 
 import os
 import platform
@@ -16,45 +16,52 @@ from itertools import count
 from pathlib import Path
 from typing import Any, Final
 
-from cprl.runs.files import LOCK_FILE, RECIPE_FORMAT, RunLock, digest_of, read_json, refuse_newer, write_json
-from cprl.runs.files import RECIPE_FILE as RECIPE_FILE
+from cprl.runs.files import (
+    LOCK_FILE,
+    RECIPE_FILE as RECIPE_FILE,
+    RECIPE_FORMAT,
+    RunLock,
+    digest_of,
+    read_json,
+    refuse_newer,
+    write_json,
+)
 from cprl.runs.length import Length, without_length
-from cprl.system.output import ERR, console, printed
+from cprl.system.output import ERR, console, quote_command
 from cprl.system.process import cpu
-from cprl.system.shipped import PROGRAM, command_of, cprl_here
+from cprl.system.shipped import PROGRAM, cprl_command, typed_command_line
 from cprl.values import (
-    OWN_METRICS,
+    METRIC_WORDS,
     custom_targets,
-    described,
-    differences,
+    describe_changes,
+    describe_customs,
     live_targets,
     refusal,
     refuse_live,
-    shown,
+    short_repr,
     source_of,
-    without_departed,
 )
 
-_RESUMES: Final = ("--resume", "--no-resume", "--take-over", "--no-take-over")
-_DIRECTORIES: Final = ("--out", "--runs")
-_NAMED: Final = 5
+_RESUME_FLAGS: Final = ("--resume", "--no-resume", "--take-over", "--no-take-over")
+_DIRECTORY_FLAGS: Final = ("--out", "--runs")
+_MOST_NAMED: Final = 5
 """The largest number of differences between two recipes that an error names."""
 
-PACKAGES: Final = ("cprl", "torch", "torchrl", "tensordict", "numpy", "numba", "rerun-sdk")
+RECORDED_PACKAGES: Final = ("cprl", "torch", "torchrl", "tensordict", "numpy", "numba", "rerun-sdk")
 """The packages whose versions are recorded."""
 
 
-_COMMAND: Final[ContextVar[Sequence[str] | None]] = ContextVar("command", default=None)
+_CURRENT_COMMAND: Final[ContextVar[Sequence[str] | None]] = ContextVar("command", default=None)
 
 
 @contextmanager
 def started_by(command: Sequence[str]) -> Iterator[None]:
-    """Within the block runs begin, and are resumed, by a command line, script first."""
-    token = _COMMAND.set(command)
+    """Record a command line, script first, for the runs that begin or are resumed in the block."""
+    token = _CURRENT_COMMAND.set(command)
     try:
         yield
     finally:
-        _COMMAND.reset(token)
+        _CURRENT_COMMAND.reset(token)
 
 
 def start_run(
@@ -69,7 +76,7 @@ def start_run(
 
     Args:
         out: the directory, new or empty; None for `runs/<name>-<YYYYmmdd-HHMMSS>` in the working directory.
-        to_recipe: makes the recipe for a directory, e.g. `cprl.Experiment.to_recipe`.
+        to_recipe: returns the recipe for a directory, e.g. `cprl.Experiment.to_recipe`.
         command: the command line, script first; by default that of `started_by`, or of this process.
 
     Raises:
@@ -91,21 +98,21 @@ def start_run(
             recipe = {
                 **recipe,
                 **_circumstances(recipe),
-                **_code_text(recipe),
+                **_code_by_checksum(recipe),
                 "started": started.isoformat(timespec="seconds"),
-                "command": _command(command or _COMMAND.get() or sys.argv),
+                "command": _published_command(command or _CURRENT_COMMAND.get() or sys.argv),
             }
             write_json(directory / RECIPE_FILE, recipe)
     except BaseException:
         if is_new:
-            with suppress(OSError):  # not where another process has begun a run there
+            with suppress(OSError):  # fails if another process has begun a run there
                 directory.rmdir()
         raise
     return directory
 
 
 def _new_directory(name: str, started: datetime) -> Path:
-    """runs/<name>-<time>, with the suffix -2, -3 and so on for runs that start in the same second."""
+    """Make `runs/<name>-<time>`, with the suffix -2, -3 and so on for runs that start in the same second."""
     for number in count(1):
         suffix = "" if number == 1 else f"-{number}"
         directory = Path("runs", f"{name}-{started:%Y%m%d-%H%M%S}{suffix}")
@@ -123,25 +130,26 @@ def _refuse_contents(directory: Path) -> None:
 def refuse_another_run(
     out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]], kind: Any = None
 ) -> Length:
-    """Refuse to resume what was not begun with the same recipe; only its number of episodes, or of steps, may
-    grow, and `on_nan` be another.
+    """Refuse to resume a run with another recipe than it began with; only its length may grow, and `on_nan`
+    change.
 
     Args:
-        kind: the dataclass of what the recipe holds, `cprl.Experiment`; fields that an earlier version did
-            not know are then no differences while they have their defaults.
+        kind: the dataclass in the recipe, `cprl.Experiment`; fields that an earlier version lacked may then
+            have their defaults.
 
     Returns:
-        The length of the run so far, below that of the recipe if it is to be extended.
+        The length of the run so far, which is below that of the recipe if the run is to be extended.
     """
     if out is None:
         raise ValueError("resume requires the directory of the run as out")
-    before, now = recipe_config(read_recipe(out)), to_recipe(out)["experiment"]
-    refuse_live(before, of_others=True, where=str(out))
+    before = recipe_config(read_recipe(out))
+    now = to_recipe(out)["experiment"]
+    refuse_live(before, only_foreign=True, where=str(out))
     free = {**without_length({}), "on_nan": ""}
-    differ = differences({**before, **free}, {**now, **free}, "experiment", kind)
+    differ = describe_changes({**before, **free}, {**now, **free}, "experiment", kind)
     if differ:
-        more = f"; and {len(differ) - _NAMED} more" if len(differ) > _NAMED else ""
-        raise ValueError(f"{out} was started with another recipe: {'; '.join(differ[:_NAMED])}{more}")
+        more = f"; and {len(differ) - _MOST_NAMED} more" if len(differ) > _MOST_NAMED else ""
+        raise ValueError(f"{out} was started with another recipe: {'; '.join(differ[:_MOST_NAMED])}{more}")
     length = Length.of(before)
     length_now = Length.of(now)
     if length != length_now and not length.is_shorter_than(length_now):
@@ -167,63 +175,54 @@ def read_recipe(run: Path) -> dict[str, Any]:
         raise ValueError(f"{path} is not the recipe of a run: {error!r}") from error
     recipe_config(recipe, where=path)
     _refuse_odd_parts(recipe, path)
-    OWN_METRICS.update(recipe.get("metrics", {}))
+    METRIC_WORDS.update(recipe.get("metrics", {}))
     return recipe
 
 
 def _refuse_odd_parts(recipe: Mapping[str, Any], path: Path) -> None:
-    """Refuse a recipe that says something else than tables of the processes that wrote the run."""
+    """Refuse a recipe with malformed parts about the processes that wrote the run."""
     for name in ("extended", "resumed"):
         parts = recipe.get(name, [])
         if not isinstance(parts, list) or not all(isinstance(part, Mapping) for part in parts):
-            raise ValueError(f"{path}: {name} is {shown(parts)}; allowed: a list of tables")
-    for part in parts_of(recipe):
+            raise ValueError(f"{path}: {name} is {short_repr(parts)}; allowed: a list of tables")
+    for part in recipe_parts(recipe):
         for name in ("versions", "code", "code_text", "frozen"):
             if not isinstance(part.get(name) or {}, Mapping):
-                raise ValueError(f"{path}: {name} is {shown(part[name])}; allowed: a table")
+                raise ValueError(f"{path}: {name} is {short_repr(part[name])}; allowed: a table")
     metrics = recipe.get("metrics", {})
     tables = list(metrics.values()) if isinstance(metrics, Mapping) else [None]
     if not all(isinstance(table, Mapping) and set(map(type, table.values())) <= {str} for table in tables):
-        raise ValueError(f"{path}: metrics is {shown(metrics)}; allowed: tables of texts by name")
+        raise ValueError(f"{path}: metrics is {short_repr(metrics)}; allowed: tables of texts by name")
 
 
-def parts_of(recipe: Mapping[str, Any]) -> list[Mapping[str, Any]]:
-    """Return what a recipe says of each process that wrote the run: of the first, of those before it was
-    extended, and of those that resumed it."""
+def recipe_parts(recipe: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Return the part of a recipe about each process that wrote the run: the first, those before an
+    extension, and those that resumed it."""
     return [recipe, *recipe.get("extended", ()), *recipe.get("resumed", ())]
 
 
 def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") -> dict[str, Any]:
-    """The experiment of a recipe, as `Experiment.to_config` gives it.
+    """Return the experiment of a recipe, as `Experiment.to_config` gives it.
 
     Args:
-        where: what the recipe is called in messages.
+        where: the name of the recipe in messages.
     """
     refuse_newer(where, recipe, RECIPE_FORMAT)
     if recipe.get("format") != RECIPE_FORMAT or not isinstance(recipe.get("experiment"), Mapping):
         raise ValueError(
-            f"{where} is not the recipe of a run: it has the format {shown(recipe.get('format'))}; allowed: "
-            f'{RECIPE_FORMAT}, with a table "experiment"'
+            f"{where} is not the recipe of a run: it has the format {short_repr(recipe.get('format'))}; "
+            f'allowed: {RECIPE_FORMAT}, with a table "experiment"'
         )
-    return stored_experiment(recipe["experiment"])
-
-
-BEFORE_AUTO: Final = {"engine": "compiled"}
-"""What an experiment means that was stored before it said how updates are computed."""
-
-
-def stored_experiment(table: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the table of an experiment, as any version stored it, as `Experiment.to_config` gives it now."""
-    return {**BEFORE_AUTO, **without_departed(table)}
+    return dict(recipe["experiment"])
 
 
 STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)(\.start_from)?\.run")
-"""A path, as studies have it, that names the run of a `Frozen` agent."""
+"""The path of a study's factor that is the run of a `Frozen` agent."""
 
 
 def with_runs_moved(table: Any, start: str | Path, end: str | Path, *, is_run: bool = False) -> Any:
-    """Return a table, of an experiment or of values by path, in which the runs of `Frozen` agents, relative
-    to `start`, are relative to `end`; an argument of the user's own that is called "run" stays."""
+    """Return a table, of an experiment or of values by path, in which the runs of `Frozen` agents are
+    relative to `end` instead of `start`. An argument "run" of user code stays."""
     if isinstance(table, str) and is_run and not os.path.isabs(table):
         return os.path.relpath(os.path.join(start, table), end)
     if isinstance(table, list):
@@ -236,7 +235,7 @@ def with_runs_moved(table: Any, start: str | Path, end: str | Path, *, is_run: b
 
 
 def runs_in(paths: Iterable[Path | str]) -> list[Path]:
-    """The runs among paths: each is a run's directory, or one that holds runs, in order."""
+    """Return the runs among paths, in order: each is a run's directory, or one that holds runs."""
     runs: list[Path] = []
     for folder in map(Path, paths):
         is_run = (folder / RECIPE_FILE).exists()
@@ -246,24 +245,24 @@ def runs_in(paths: Iterable[Path | str]) -> list[Path]:
         runs += inside
     if not runs:
         raise refusal("runs", paths, "at least one directory of a run")
-    places = [run.resolve() for run in runs]
-    for run, place in zip(runs, places, strict=True):
-        if places.count(place) > 1:
+    resolved = [run.resolve() for run in runs]
+    for run, path in zip(runs, resolved, strict=True):
+        if resolved.count(path) > 1:
             raise ValueError(f"{run} is there twice; allowed: each run once")
     return runs
 
 
 def write_length(run: Path, before: Length, length: Length) -> None:
-    """Write into a run's recipe from which length to which it is extended, and by which versions."""
+    """Record in a run's recipe that it is extended from a length to another, and by which versions."""
     recipe = read_recipe(run)
     earlier = {before.unit: before.number, **_circumstances(recipe)}
     recipe["experiment"][length.unit] = length.number
-    recipe |= {**_code_text(recipe), "extended": [*recipe.get("extended", []), earlier]}
+    recipe |= {**_code_by_checksum(recipe), "extended": [*recipe.get("extended", []), earlier]}
     write_json(run / RECIPE_FILE, recipe)
 
 
 def write_on_nan(run: Path, on_nan: str) -> None:
-    """Write into a run's recipe what now happens where a number is not finite."""
+    """Record in a run's recipe a new value of `on_nan`."""
     recipe = read_recipe(run)
     if recipe["experiment"].get("on_nan") != on_nan:
         recipe["experiment"]["on_nan"] = on_nan
@@ -271,34 +270,36 @@ def write_on_nan(run: Path, on_nan: str) -> None:
 
 
 def write_metrics(run: Path, words: Mapping[str, Mapping[str, str]]) -> None:
-    """Write into a run's recipe what metrics of the user's own are called: "title" and "unit" by name."""
+    """Record the "title" and "unit" of custom metrics by name in a run's recipe."""
     recipe = read_recipe(run)
     if recipe.get("metrics", {}) != words:
         write_json(run / RECIPE_FILE, {**recipe, "metrics": words})
-    OWN_METRICS.update(words)
+    METRIC_WORDS.update(words)
 
 
 def write_circumstances(run: Path) -> list[str]:
-    """Write into a run's recipe under which versions, git commit, processor and code of the user's own it is
-    resumed, if they are not those of its last process.
+    """Record versions, git commit, processor and user code in a run's recipe, if they differ from its last
+    process.
 
     Returns:
-        What differs now from when the run was started, a sentence for each, so that its numbers may differ
-        from an uninterrupted run.
+        The changes since the run was started, a sentence each; with any, its numbers may differ from those of
+        an uninterrupted run.
     """
     recipe = read_recipe(run)
     now = _circumstances(recipe)
     before = {name: recipe[name] for name in now if recipe.get(name) is not None}
     last = (recipe.get("resumed") or [recipe])[-1]
-    changed = [line for name in before for line in differences(before[name], now[name], name)]
     if any(last.get(name) != now[name] for name in now):
-        recipe |= {**_code_text(recipe), "resumed": [*recipe.get("resumed", []), now]}
+        recipe |= {**_code_by_checksum(recipe), "resumed": [*recipe.get("resumed", []), now]}
         write_json(run / RECIPE_FILE, recipe)
-    return changed
+    changes = []
+    for name, value in before.items():
+        changes += describe_changes(value, now[name], name)
+    return changes
 
 
-def say_changes(run: Path, changes: Sequence[str]) -> None:
-    """Warn on standard error where a run is used under other circumstances than those it was made under."""
+def warn_of_changes(run: Path, changes: Sequence[str]) -> None:
+    """Warn on standard error if a run is used under other circumstances than it was started under."""
     if changes:
         console(ERR).print(
             f"Warning: {run} was begun under other versions or other code, so its numbers may differ from "
@@ -309,43 +310,46 @@ def say_changes(run: Path, changes: Sequence[str]) -> None:
 
 
 def changed_code(recipe: Mapping[str, Any]) -> list[str]:
-    """Return the modules of the user's own that have another text now than when a run or a part of it began.
+    """Return the modules of user code whose source has changed since a run, or a part of it, began.
 
-    Those of which the recipe has no checksum, and those that are gone, count as unchanged.
+    Modules without a checksum in the recipe, and modules that no longer exist, count as unchanged.
     """
-    now = _code(recipe)
-    before = [item for part in parts_of(recipe) for item in (part.get("code") or {}).items()]
+    now = _code_checksums(recipe)
+    before = [item for part in recipe_parts(recipe) for item in (part.get("code") or {}).items()]
     return sorted({module for module, digest in before if now.get(module, digest) != digest})
 
 
 def _circumstances(recipe: Mapping[str, Any]) -> dict[str, Any]:
-    code = _code(recipe)
+    code = _code_checksums(recipe)
     return {"versions": versions(), "git": git_state(), "cpu": cpu(), **({"code": code} if code else {})}
 
 
-def _code(recipe: Mapping[str, Any]) -> dict[str, str]:
+def _code_checksums(recipe: Mapping[str, Any]) -> dict[str, str]:
     return {module: digest_of(text) for module, text in _sources(recipe).items()}
 
 
-def _code_text(recipe: Mapping[str, Any]) -> dict[str, dict[str, str]]:
-    """What a recipe says of these texts: each by its checksum, with those of before."""
+def _code_by_checksum(recipe: Mapping[str, Any]) -> dict[str, dict[str, str]]:
+    """Return the sources of user code by checksum for a recipe, with those that it has already."""
     texts = {digest_of(text): text for text in _sources(recipe).values()}
     return {"code_text": {**(recipe.get("code_text") or {}), **texts}} if texts else {}
 
 
 def _sources(recipe: Mapping[str, Any]) -> dict[str, str]:
-    """The text of each module that a `Custom` of a recipe names, without packages whose versions it has."""
+    """Return the source of each module that a `Custom` of a recipe names, except packages with a recorded
+    version."""
     table = recipe.get("experiment")
     modules = {target.partition(":")[0] for target in (*custom_targets(table), *live_targets(table))}
-    texts = {name: source_of(name) for name in sorted(modules) if name.partition(".")[0] not in PACKAGES}
+    texts = {
+        name: source_of(name) for name in sorted(modules) if name.partition(".")[0] not in RECORDED_PACKAGES
+    }
     return {module: text for module, text in texts.items() if text is not None}
 
 
 def versions() -> dict[str, str | None]:
-    """Return the versions of Python and of `PACKAGES`; None for packages that are not installed."""
-    numbers: dict[str, str | None] = dict.fromkeys(("python", *PACKAGES))
+    """Return the versions of Python and of `RECORDED_PACKAGES`; None for packages that are not installed."""
+    numbers: dict[str, str | None] = dict.fromkeys(("python", *RECORDED_PACKAGES))
     numbers["python"] = platform.python_version()
-    for package in PACKAGES:
+    for package in RECORDED_PACKAGES:
         with suppress(PackageNotFoundError):
             numbers[package] = version(package)
     return numbers
@@ -355,46 +359,47 @@ def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
     """Return the command line that resumes a run.
 
     Args:
-        command: the command line that started or resumed it, script first; by default that of `started_by`.
-            A run that was started from Python without one is resumed by `cprl run`; one with live code only
-            by the process that has it.
+        command: the command line that started or resumed it, script first; by default that of `started_by`. A
+            run that Python started without one is resumed by `cprl run`; a run with live code only by this
+            process.
     """
-    command = command or _COMMAND.get()
-    directory = f"./{run}" if str(run).startswith("-") else str(run)  # not to be read as a flag
+    command = command or _CURRENT_COMMAND.get()
+    directory = f"./{run}" if str(run).startswith("-") else str(run)  # so that it is not read as a flag
     path = run / RECIPE_FILE
     table = read_json(path).get("experiment") if path.exists() else None
-    if live := live_targets(table):
-        has = ", ".join(live)
-        return (
-            f"cprl.run(..., {str(run)!r}, resume=True) in this process; no other can, as it alone has {has}"
-        )
+    live = ", ".join(live_targets(table))
+    if live:
+        again = f"cprl.run(..., {str(run)!r}, resume=True)"
+        return f"{again} in this process; no other can, as it alone has {live}"
     if command is None:
         allow = [word for target in custom_targets(table) for word in ("--allow", target)]
-        return printed([*cprl_here(), "run", directory, "--resume", *allow])
-    words = without_options(command, _DIRECTORIES)
-    words = command_of([word for word in words if word.replace("_", "-") not in _RESUMES])
-    return printed([*words, "--out", directory, "--resume"])
+        return quote_command([*cprl_command(), "run", directory, "--resume", *allow])
+    words = without_options(command, _DIRECTORY_FLAGS)
+    words = typed_command_line([word for word in words if word.replace("_", "-") not in _RESUME_FLAGS])
+    return quote_command([*words, "--out", directory, "--resume"])
 
 
-def _command(words: Sequence[str]) -> str:
-    """A command line without local directories, because recipes are published: the script relative to the
-    working directory, or its name alone, no `--out` and no `--runs`."""
+def _published_command(words: Sequence[str]) -> str:
+    """Return a command line without local directories, because recipes are published: without `--out` and
+    `--runs`, and the script relative to the working directory, or by its name."""
     first = words[0].split(" ") if words[0].startswith(PROGRAM) else [without_directories(words[0])]
-    return shlex.join([*first, *without_options(words[1:], _DIRECTORIES)])
+    return shlex.join([*first, *without_options(words[1:], _DIRECTORY_FLAGS)])
 
 
 def without_directories(program: str) -> str:
-    """The first word of a command line as recipes and summaries have it, which are published: relative to the
-    working directory, or its name alone."""
-    path, here = Path(program), Path.cwd()
+    """Return the first word of a command line for publication: relative to the working directory, or by its
+    name."""
+    path = Path(program)
+    here = Path.cwd()
     if path.is_absolute():
         path = path.relative_to(here) if path.is_relative_to(here) else Path(path.name)
     return str(path)
 
 
 def without_options(words: Sequence[str], options: Sequence[str]) -> list[str]:
-    """The words of a command line without some options, such as "--out", and the value of each."""
-    rest, others = iter(words), []
+    """Return the words of a command line without some options, such as "--out", and their values."""
+    rest = iter(words)
+    others = []
     for word in rest:
         if word in options:
             next(rest, None)
@@ -404,31 +409,31 @@ def without_options(words: Sequence[str], options: Sequence[str]) -> list[str]:
 
 
 BUILT_FROM: Final = "commit.json"
-"""The file of the package that says from which commit a wheel was built; `hatch_build.py` writes it."""
+"""The file of a wheel's package with the commit that it was built from; `hatch_build.py` writes it."""
 
 _PACKAGE: Final = Path(__file__).parents[1]
-_OF_ANOTHER: Final = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
-"""Variables that lead git to another checkout than that of the folder, as in a hook."""
+_GIT_VARIABLES: Final = ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE")
+"""Variables that lead git to another checkout, e.g. in a hook."""
 
 
 def git_state(package: Path = _PACKAGE) -> dict[str, str | bool] | None:
-    """Return the commit of the code of cprl, wherever this process stands, and whether a tracked file was
-    changed since, as {"commit": 40 hexadecimal digits, "dirty": bool}; None where no commit is known: of a
-    wheel that was built outside a checkout, or of files that git does not track."""
+    """Return the commit of cprl's code, and whether tracked files have changed since, as {"commit": 40
+    hexadecimal digits, "dirty": bool}; None if no commit is known, e.g. for a wheel that was built outside a
+    checkout."""
     written = package / BUILT_FROM
     if written.is_file():
-        built = read_json(written)
-        return {"commit": str(built["commit"]), "dirty": bool(built["dirty"])}
-    if _git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
+        commit = read_json(written)
+        return {"commit": str(commit["commit"]), "dirty": bool(commit["dirty"])}
+    if _run_git(package, "ls-files", "--error-unmatch", "__init__.py") is None:
         return None
-    state = _git(package, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
+    state = _run_git(package, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
     if state is None:
         return None
     return {"commit": state.removesuffix("-dirty"), "dirty": state.endswith("-dirty")}
 
 
-def _git(folder: Path, *arguments: str) -> str | None:
-    environment = {name: value for name, value in os.environ.items() if name not in _OF_ANOTHER}
+def _run_git(folder: Path, *arguments: str) -> str | None:
+    environment = {name: value for name, value in os.environ.items() if name not in _GIT_VARIABLES}
     words = ["git", "-C", str(folder), *arguments]
     try:
         done = subprocess.run(words, capture_output=True, text=True, check=True, timeout=10, env=environment)
@@ -437,9 +442,6 @@ def _git(folder: Path, *arguments: str) -> str | None:
     return done.stdout.strip()
 
 
-_OF_RULES: Final = ("game", "transforms")
-
-
-def rules_of_own(table: Mapping[str, Any]) -> str:
-    """Return the rules of the user's own in words, of an experiment as a recipe stores it; "" without any."""
-    return "; ".join(described([table.get(name) for name in _OF_RULES]))
+def custom_rules_in(table: Mapping[str, Any]) -> str:
+    """Return a description of the custom rules in a stored experiment; "" without any."""
+    return "; ".join(describe_customs([table.get("game"), table.get("transforms")]))

@@ -1,10 +1,10 @@
-"""Executors: where the trials of a study are run: in this process, in processes of this machine, or by Ray.
+"""Executors: they run the trials of a study, in this process or in processes of this machine.
 
-Each makes finished runs of the same directories by the same `cprl run`, so a study may go on elsewhere than
-where it began. What is done and what is not is read from the directories, never from an executor.
+All executors produce the same finished runs in the same directories. So a study may be stopped and continued
+with another executor, and what is finished is read from the directories alone. `cprl.experimental` has an
+executor for Ray.
 """
 
-import logging
 import os
 import signal
 import subprocess
@@ -15,49 +15,49 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from dataclasses import dataclass, field
-from importlib import import_module
-from importlib.util import find_spec
-from typing import Annotated, Any, Final, Protocol
+from dataclasses import dataclass
+from typing import Annotated, Final, Protocol
 
 from cprl.runs.checkpoints import interruption
-from cprl.studies.status import STOPPED, Status
-from cprl.studies.trials import ATTEMPTS, Outcome, Task
+from cprl.studies.trials import ATTEMPTS, Task, TrialOutcome
 from cprl.system.output import console
-from cprl.system.process import at_signals
-from cprl.values import Range, Value, Where
+from cprl.system.process import on_signals
+from cprl.values import Range, Value
 
 Jobs = Annotated[int, Range(1, 4096)]
-"""Trials that run at a time."""
-_LOOK_S: Final = 0.1
-"""Seconds between two looks at which processes have ended, and at whether this one was asked to stop."""
+"""The number of trials that run at the same time."""
+LOOK_S: Final = 0.1
+"""Seconds between two checks of a process, and of whether this process was asked to stop."""
 
 
 class Executor(Protocol):
-    """Runs trials; an outcome is yielded as soon as one has ended, in whatever order.
+    """An object that runs trials and yields the outcome of each as soon as it has ended.
 
-    It stops what it started when its generator is closed. At the first SIGINT or SIGTERM of the process that
-    iterates, every running trial finishes its step and saves a checkpoint, and `KeyboardInterrupt` or
-    `SystemExit` with code 143 is raised; the same line again continues.
+    Closing the generator stops the trials that run. At the first SIGINT or SIGTERM, every running trial
+    finishes its step and saves a checkpoint; then `KeyboardInterrupt`, or `SystemExit` with code 143, is
+    raised.
     """
 
-    def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+    def run(self, tasks: Sequence[Task]) -> Generator[TrialOutcome, None, None]:
         """Run every trial; they begin in order."""
 
 
 @dataclass(frozen=True)
 class InProcess:
-    """One trial after the other, in this process, which imports and compiles once: for tiny trainings."""
+    """Runs one trial after the other in this process. It imports and compiles only once, which suits tiny
+    trainings."""
 
-    def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+    def run(self, tasks: Sequence[Task]) -> Generator[TrialOutcome, None, None]:
         for task in tasks:
             yield task.run_here()
 
 
 @contextmanager
-def signals() -> Iterator[list[int]]:
-    """Return the signals by which this process is asked to stop in the block, as they come; what is done
-    about them is up to the block."""
+def stop_signals() -> Iterator[list[int]]:
+    """Collect the signals that ask this process to stop, and yield the growing list of their numbers.
+
+    The block decides what to do about them.
+    """
     numbers: list[int] = []
 
     def note(number: int) -> None:
@@ -68,15 +68,14 @@ def signals() -> Iterator[list[int]]:
                 soft_wrap=True,
             )
 
-    with at_signals(note):
+    with on_signals(note):
         yield numbers
 
 
-class _SideBySide(ABC):
-    """Runs trials in processes of their own, some at a time.
+class SideBySide(ABC):
+    """Base of executors that run several trials at the same time, each in a process of its own.
 
-    One whose process dies is tried again, up to `ATTEMPTS` times, and resumed from its checkpoint; the others
-    are not disturbed.
+    A trial whose process dies is resumed from its checkpoint, up to `ATTEMPTS` times; other trials go on.
     """
 
     @abstractmethod
@@ -88,10 +87,11 @@ class _SideBySide(ABC):
         """Run the process of a trial; ask it to stop when this one is asked, kill it the second time."""
 
     def ready(self) -> AbstractContextManager[object]:
-        """In which processes are started."""
+        """Return the context in which processes are started."""
         return nullcontext()
 
-    def run(self, tasks: Sequence[Task]) -> Generator[Outcome, None, None]:
+    def run(self, tasks: Sequence[Task]) -> Generator[TrialOutcome, None, None]:
+        """Run trials side by side; yield each outcome as soon as it is known."""
         waiting: list[Task] = []
         for task in tasks:
             outcome = task.settled()
@@ -101,7 +101,7 @@ class _SideBySide(ABC):
                 yield outcome
         if not waiting:
             return
-        with self.ready(), signals() as stops, ThreadPoolExecutor(self.places()) as pool:
+        with self.ready(), stop_signals() as stops, ThreadPoolExecutor(self.places()) as pool:
             try:
                 left = 0
                 for future in as_completed([pool.submit(self._carry_out, task, stops) for task in waiting]):
@@ -119,7 +119,7 @@ class _SideBySide(ABC):
                 if not stops:  # but this generator is closed, or nothing runs
                     stops.append(signal.SIGTERM)
 
-    def _carry_out(self, task: Task, stops: Sequence[int]) -> Outcome | None:
+    def _carry_out(self, task: Task, stops: Sequence[int]) -> TrialOutcome | None:
         """Run a trial, in a thread; None if this process was asked to stop."""
         for _ in range(ATTEMPTS):
             outcome = None if stops else task.begin()
@@ -136,10 +136,10 @@ class _SideBySide(ABC):
 
 
 @dataclass(frozen=True)
-class Processes(Value, _SideBySide, stored=False):
-    """Processes on this machine, one for each trial, each with one thread of torch.
+class Processes(Value, SideBySide, stored=False):
+    """Runs each trial in a process of this machine, with one thread of torch.
 
-    Each has the trial's log as its output, and ends at once if the process that runs the study dies.
+    The output of a process is added to the trial's log. A process ends if the process of the study dies.
 
     Args:
         jobs: how many trials run at a time; as many cores and the memory of as many runs.
@@ -153,16 +153,16 @@ class Processes(Value, _SideBySide, stored=False):
     def exit_code(self, task: Task, stops: Sequence[int]) -> int:
         def is_over() -> bool:
             is_running = process.poll() is None
-            time.sleep(_LOOK_S * is_running)
+            time.sleep(LOOK_S * is_running)
             return not is_running
 
-        with _started(task.arguments, str(task.status.log), task.variables) as process:
-            _attend(is_over, stops, lambda kill: process.kill() if kill else _ask_to_stop(process))
+        with start_process(task.arguments, str(task.status.log), task.variables) as process:
+            wait_or_stop(is_over, stops, lambda kill: process.kill() if kill else ask_to_stop(process))
             return process.wait()
 
 
-def _attend(is_over: Callable[[], object], stops: Sequence[int], stop: Callable[[bool], object]) -> None:
-    """Wait until a process is over, and stop it when this one is asked to, the second time by force."""
+def wait_or_stop(is_over: Callable[[], object], stops: Sequence[int], stop: Callable[[bool], object]) -> None:
+    """Wait until a process is over. When this process is asked to stop, stop it; the second time, kill it."""
     heard = 0
     while not is_over():
         if heard < len(stops):
@@ -170,7 +170,10 @@ def _attend(is_over: Callable[[], object], stops: Sequence[int], stop: Callable[
             stop(heard > 1)
 
 
-def _started(arguments: Sequence[str], log: str, variables: Mapping[str, str]) -> "subprocess.Popen[bytes]":
+def start_process(
+    arguments: Sequence[str], log: str, variables: Mapping[str, str]
+) -> "subprocess.Popen[bytes]":
+    """Start the process of a trial, whose output is added to its log."""
     with open(log, "ab") as file:
         return subprocess.Popen(
             [sys.executable, *arguments],
@@ -182,109 +185,8 @@ def _started(arguments: Sequence[str], log: str, variables: Mapping[str, str]) -
         )
 
 
-def _ask_to_stop(process: "subprocess.Popen[bytes]") -> None:
+def ask_to_stop(process: "subprocess.Popen[bytes]") -> None:
+    """Ask a process that a study started to save a checkpoint and end."""
     assert process.stdin is not None
     with suppress(OSError):  # it has ended
         os.write(process.stdin.fileno(), b"!")
-
-
-_STORE_BYTES: Final = 80 * 2**20
-"""Of Ray's store of objects, which holds nothing of ours; Ray wants at least 75 MiB."""
-_BYTES: Final = 1_000_000_000
-"""What a trial asks for while nobody knows more: torch, Numba, the game and the networks take 850 MB."""
-
-
-@dataclass(frozen=True)
-class Ray(Value, _SideBySide, stored=False):
-    """Tasks of Ray, each of which runs a trial in a process of its own, on one core.
-
-    A study that is killed with all of Ray continues when it is started again. On a cluster every node has the
-    same Python, Ray, cprl and dependencies, and the study's directory is on a file system that all nodes
-    share, under the same path. What a dead node has locked is taken over after
-    `cprl.studies.trials.PATIENCE_S` seconds without a sign of life.
-
-    Args:
-        address: of a cluster: "auto" for the one that this machine belongs to, or "host:port". None for a
-            Ray of this machine, which is started for the study and ends with it. Where this process has
-            called `ray.init` already, that Ray is used, and left as it is.
-        jobs: how many trials run at a time, at most; None for one per core that there is now. Where there are
-            fewer cores, tasks wait in Ray, so that a cluster that can grow knows that it should.
-        memory_bytes: what each trial asks for; None for a tenth more than any trial of the study has taken
-            so far, and 1 GB while that is less.
-    """
-
-    address: Annotated[str, Where(lambda text: bool(text.strip()), '"auto", "host:port"')] | None = None
-    jobs: Jobs | None = field(default=None, kw_only=True)
-    memory_bytes: Annotated[int, Range(1, 2**63 - 1)] | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if find_spec("ray") is None:
-            raise ModuleNotFoundError('Ray is not installed; run pip install "cprl[ray]"', name="ray")
-
-    @contextmanager
-    def ready(self) -> Iterator[None]:
-        """Connected to Ray; afterwards as it was before."""
-        os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # nothing is sent to Ray's makers
-        os.environ.setdefault("RAY_worker_niceness", "0")  # Ray's own is 15: a tenth of a busy machine
-        ray: Any = import_module("ray")
-        ray.cloudpickle.register_pickle_by_value(sys.modules[__name__])
-        if ray.is_initialized():
-            yield
-            return
-        options: dict[str, Any] = {"log_to_driver": False, "logging_level": logging.ERROR}
-        if self.address is None:
-            cores = min(self.jobs or sys.maxsize, os.cpu_count() or 1)
-            options |= {"num_cpus": cores, "include_dashboard": False, "object_store_memory": _STORE_BYTES}
-        ray.init(self.address or "local", **options)
-        try:
-            yield
-        finally:
-            ray.shutdown()
-
-    def places(self) -> int:
-        ray: Any = import_module("ray")
-        return self.jobs or max(1, int(ray.cluster_resources().get("CPU", 1)))
-
-    def exit_code(self, task: Task, stops: Sequence[int]) -> int:
-        ray: Any = import_module("ray")
-        nodes = [int(node["Resources"].get("memory", 0)) for node in ray.nodes() if node["Alive"]]
-        memory = self.memory_bytes or bytes_of(task)
-        if any(nodes):
-            memory = min(memory, max(nodes))  # more than any node has would wait forever
-        work = ray.remote(num_cpus=1, memory=memory, max_retries=0)(_wait)
-        reference = work.remote(task.arguments, os.path.abspath(task.status.log), task.variables)
-        errors = ray.exceptions
-        _attend(
-            lambda: ray.wait([reference], timeout=_LOOK_S)[0],
-            stops,
-            lambda kill: ray.cancel(reference, force=kill),
-        )
-        try:
-            return int(ray.get(reference))
-        except errors.TaskCancelledError:
-            return STOPPED[-1]
-        except (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError):
-            return -9  # as after SIGKILL
-        except errors.RayError as error:  # e.g. the node does not have the study's directory
-            lines = str(error).strip().splitlines() or [""]
-            task.status.fail(f"{type(error).__name__}: {lines[-1].strip()}", "\n".join(lines))
-            return 1
-
-
-def _wait(arguments: Sequence[str], log: str, variables: Mapping[str, str]) -> int:
-    with _started(arguments, log, variables) as process:
-        while True:
-            try:
-                return process.wait(0.1)
-            except subprocess.TimeoutExpired:
-                pass
-            except KeyboardInterrupt:  # Ray's way of asking
-                _ask_to_stop(process)
-
-
-def bytes_of(task: Task) -> int:
-    """Return what a trial is expected to take, a tenth more than any of its study has taken so far."""
-    folder = task.status.folder
-    peaks = [Status(folder, path.stem).read().get("peak_bytes", 0) for path in folder.glob("*.json")]
-    return max(_BYTES, round(1.1 * max(peaks, default=0)))

@@ -1,9 +1,9 @@
-"""What the conditions of a study differ in: places in an experiment, levels for them, and random draws.
+"""Factors: the fields of an experiment that a study varies, and the values that it tries.
 
-A path names a place in the experiment's table (`Experiment.to_config`), e.g.
-"agents.*.algorithm.settings.gamma": a name is a field or an argument of a `Custom`, a number a place in a
-list. `*` stands for each value of a list; in `agents` for each agent that learns. Words may be written with
-"-", as flags are.
+A path names a field by its place in the experiment's table (`Experiment.to_config`), e.g.
+"agents.*.algorithm.settings.gamma". Each part of a path is the name of a field, the name of an argument of a
+`Custom`, or the index of an element of a list. `*` means all elements of a list; in `agents` it means all
+agents that learn. A path may be written with "-" for "_", as flags are.
 """
 
 import re
@@ -30,32 +30,32 @@ from cprl.values import (
     Custom,
     Range,
     Value,
+    as_custom,
     checked,
     custom_targets,
-    fits,
+    describe_type,
+    did_you_mean,
     from_config,
-    handed_over,
     hints_of,
-    meant,
+    matches_type,
     refusal,
-    shown,
+    short_repr,
     to_config,
     trusting,
-    words,
 )
-from cprl.values.arrays import Float64
+from cprl.values.array_types import Float64
 
 ALL: Final = "*"
 
 
-def changed(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
-    """Return an experiment with other values in some places, all of them changed at once.
+def with_changes(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
+    """Return an experiment with other values of some fields, all changed together.
 
-    A path within a value that is changed too applies to the new value, and one with a number after one
-    with `*`.
+    A path that leads into another changed value applies to the new value. A path with an index wins over the
+    same path with `*`.
 
     Args:
-        changes: the new values by path; lists become tuples, and a board may be given by its name.
+        changes: the new values by path. Lists become tuples, and a board may be given by its name.
     """
     table = experiment.to_config()
     for path in sorted(changes, key=lambda path: (path.count("."), ALL not in path)):
@@ -64,7 +64,7 @@ def changed(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
             held = holder[name]
             if isinstance(value, str) and isinstance(held, Mapping) and held.get("kind") == "Map":
                 try:
-                    value = maps.named(value)
+                    value = maps.published(value)
                 except ValueError as error:
                     raise ValueError(f"at the path {path}: {error}") from error
             holder[name] = to_config(stored_game(value), f"the value at the path {path}")
@@ -76,29 +76,35 @@ def changed(experiment: Experiment, changes: Mapping[str, Any]) -> Experiment:
 
 
 def values_at(experiment: Experiment, path: str) -> list[Any]:
-    """Return the values in the places that a path names, at least one."""
+    """Return the values of all fields that a path means, at least one."""
     tables = [holder[name] for holder, name in places(experiment.to_config(), path)]
     with trusting(custom_targets(tables)):
         return [_value_of(path, table) for table in tables]
 
 
 def places(table: dict[str, Any], path: str) -> list[tuple[Any, Any]]:
-    """Return the tables and lists that hold the places of a path, with the name or number in each."""
+    """Return the fields that a path means, each as (the table or list that holds it, its name or index)."""
     *outer, last = normalised(path).split(".")
     holders: list[Any] = [table]
     for depth, name in enumerate(outer):
-        at = outer[:depth]
-        holders = [inner[key] for holder in holders for inner, key in _named(holder, name, at)]
-    return [place for holder in holders for place in _named(holder, last, outer)]
+        above = outer[:depth]
+        holders = [inner[key] for holder in holders for inner, key in _places_in(holder, name, above)]
+    return [place for holder in holders for place in _places_in(holder, last, outer)]
 
 
-def _named(holder: Any, name: str, at: list[str]) -> list[tuple[Any, Any]]:
-    where = ".".join(at) or "the experiment"
-    path = ".".join([*at, name])
+def _places_in(holder: Any, name: str, above: list[str]) -> list[tuple[Any, Any]]:
+    """Return the fields of one table or list that one part of a path means, as `places` does.
+
+    Args:
+        above: the parts of the path that lead to this table or list.
+    """
+    where = ".".join(above) or "the experiment"
+    path = ".".join([*above, name])
     if isinstance(holder, list) and name == ALL:
-        learns = [entry["kind"] in ("Learning", "Team") if at == ["agents"] else True for entry in holder]
-        if any(learns):
-            return [(holder, place) for place, is_meant in enumerate(learns) if is_meant]
+        is_all = above != ["agents"]
+        matches = [is_all or entry["kind"] in ("Learning", "Team") for entry in holder]
+        if any(matches):
+            return [(holder, place) for place, is_match in enumerate(matches) if is_match]
         raise ValueError(f"the path {path} matches nothing: {where} has no agent that learns")
     if isinstance(holder, Mapping) and holder.get("kind") == "Custom" and name in holder["arguments"]:
         holder = holder["arguments"]  # a field of a game of the user's own
@@ -109,13 +115,14 @@ def _named(holder: Any, name: str, at: list[str]) -> list[tuple[Any, Any]]:
         names = [key for key in holder if key != "kind"]
     if name in names:
         return [(holder, int(name) if isinstance(holder, list) else name)]
-    has = f"{where} has {', '.join(names)}" if names else f"{where} is {shown(holder)}"
+    has = f"{where} has {', '.join(names)}" if names else f"{where} is {short_repr(holder)}"
     if holder is None:
         has += f"; give the base one, or vary {where} as a whole"
-    raise ValueError(f"the path {path} matches nothing{meant(name, names)}; {has}")
+    raise ValueError(f"the path {path} matches nothing{did_you_mean(name, names)}; {has}")
 
 
 def normalised(path: object) -> str:
+    """Return a path with "_" for "-"; refuse anything that is not a path."""
     if not isinstance(path, str) or not path or not all(path.split(".")):
         raise refusal("path", path, 'names with dots between them, e.g. "game.rules.freeze_steps"')
     return path.replace("-", "_")
@@ -124,7 +131,7 @@ def normalised(path: object) -> str:
 def _plain(value: Any) -> Any:
     if isinstance(value, np.ndarray | np.generic):
         value = value.tolist()
-    value = handed_over(value)
+    value = as_custom(value)
     return tuple(map(_plain, value)) if isinstance(value, list | tuple | range) else value
 
 
@@ -147,7 +154,11 @@ class Distribution(Value, ABC, stored=False):
 
     @abstractmethod
     def at(self, share: float) -> Any:
-        """Return the number below which this share of all lies, 0..1."""
+        """Return the quantile: the number below which this share of all numbers lies.
+
+        Args:
+            share: from 0 to 1.
+        """
 
 
 @dataclass(frozen=True)
@@ -184,31 +195,31 @@ class Integers(Distribution, stored=False):
 
 
 Factor: TypeAlias = Sequence[Any] | Mapping[str, Mapping[str, Any]] | Distribution
-"""Values of the field that its path names; or levels by name, each with its changes; or a distribution."""
+"""A list of values for a field; named levels, each a table of values by path; or a distribution."""
 DISTRIBUTIONS: Final[dict[str, type[Any]]] = {kind.__name__: kind for kind in (Uniform, LogUniform, Integers)}
 MOST_CONDITIONS: Final = 10_000
 Design = Literal["random", "latin_hypercube", "sobol"]
-"""How combinations are drawn: independently; each factor's range in as many equal parts as there are draws,
-one draw in each; or by Sobol's sequence, which fills all ranges together ever more evenly."""
+"""The ways to draw combinations. "random" draws independently. "latin_hypercube" divides the range of each
+factor into as many equal parts as there are draws, and draws once in each part. "sobol" uses Sobol's
+sequence, whose points fill all ranges together evenly."""
 
 
 @dataclass(frozen=True)
 class Level:
-    """One level of a factor: what it is called, and what it changes in the experiment, by path."""
+    """A level of a factor."""
 
     value: Any
+    """The value, or the name of a named level."""
     changes: Mapping[str, Any]
+    """The values that the level sets in the experiment, by path."""
 
 
 def checked_factors(factors: Mapping[str, Any]) -> dict[str, Factor]:
-    """Return factors as a study keeps them: paths without "-", values as tuples."""
+    """Return the factors of a study with normalised paths and with tuples of values; refuse any other."""
     normal: dict[str, Factor] = {}
     for name, factor in factors.items():
         if isinstance(factor, Mapping) and factor:
-            normal[name] = {
-                level: {normalised(path): _plain(value) for path, value in changes.items()}
-                for level, changes in factor.items()
-            }
+            normal[name] = {level: _plain_changes(changes) for level, changes in factor.items()}
             continue
         path = normalised(name)
         values = _plain(factor)
@@ -227,16 +238,20 @@ def checked_factors(factors: Mapping[str, Any]) -> dict[str, Factor]:
     return normal
 
 
+def _plain_changes(changes: Mapping[str, Any]) -> dict[str, Any]:
+    return {normalised(path): _plain(value) for path, value in changes.items()}
+
+
 def levels_of(name: str, factor: Factor) -> list[Level]:
-    """Return the levels of a factor that is no distribution."""
+    """Return the levels of a factor, which must not be a distribution."""
     assert not isinstance(factor, Distribution)
     if isinstance(factor, Mapping):
         return [Level(level, changes) for level, changes in factor.items()]
     return [Level(value, {name: value}) for value in factor]
 
 
-def grid(factors: Mapping[str, Factor]) -> list[dict[str, Level]]:
-    """Return every combination of the levels of all factors, in order."""
+def all_combinations(factors: Mapping[str, Factor]) -> list[dict[str, Level]]:
+    """Return all combinations of the factors' levels; the last factor varies fastest."""
     for name, factor in factors.items():
         if isinstance(factor, Distribution):
             raise refusal(f"factors[{name!r}]", factor, "in a grid levels, or with draws=N")
@@ -248,14 +263,17 @@ def grid(factors: Mapping[str, Factor]) -> list[dict[str, Level]]:
 
 
 _TRIES: Final = 20
-"""Draws for each one that is kept, at most, since draws of a few levels may be equal."""
+"""The number of draws for each combination that is asked for. More are drawn than asked for, since draws of
+a few levels may be equal."""
 
 
-def drawn(
+def draw_combinations(
     factors: Mapping[str, Factor], draws: int, *, seed: int, design: Design = "random"
 ) -> Iterator[dict[str, Level]]:
-    """Draw combinations of levels, more than are asked for; the first ones of more draws are the same, but
-    for those of a Latin hypercube."""
+    """Draw random combinations of levels, more than are asked for.
+
+    A larger number of draws begins with the same combinations, except in a Latin hypercube.
+    """
     for shares in _shares(len(factors), draws, seed, design):
         combination = {}
         for (name, factor), share in zip(factors.items(), shares, strict=True):
@@ -269,6 +287,7 @@ def drawn(
 
 
 def _shares(dimensions: int, draws: int, seed: int, design: Design) -> Iterable[Float64]:
+    """Return draws from 0 to 1, float64 [draws, factors]: the quantile of each factor in each combination."""
     most = _TRIES * draws
     if design == "random":
         return (np.random.default_rng([seed, number]).random(dimensions) for number in range(most))
@@ -283,6 +302,7 @@ def _shares(dimensions: int, draws: int, seed: int, design: Design) -> Iterable[
 
 
 def factor_to_config(factor: Factor) -> dict[str, Any]:
+    """Return a factor as JSON can hold it."""
     if isinstance(factor, Distribution):
         return {"distribution": type(factor).__name__, "low": factor.low, "high": factor.high}
     if isinstance(factor, Mapping):
@@ -291,6 +311,7 @@ def factor_to_config(factor: Factor) -> dict[str, Any]:
 
 
 def factor_from_config(name: str, table: Mapping[str, Any]) -> Factor:
+    """Return the factor that `factor_to_config` gave."""
     if "distribution" in table:
         distribution: Distribution = DISTRIBUTIONS[table["distribution"]](table["low"], table["high"])
         return distribution
@@ -300,10 +321,12 @@ def factor_from_config(name: str, table: Mapping[str, Any]) -> Factor:
 
 
 def changes_to_config(changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return changes by path as JSON can hold them."""
     return {path: to_config(stored_game(_plain(value)), path) for path, value in changes.items()}
 
 
 def changes_from_config(table: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the changes that `changes_to_config` gave."""
     return {path: _value_of(path, value) for path, value in table.items()}
 
 
@@ -313,8 +336,11 @@ def _value_of(path: str, table: Any) -> Any:
 
 
 def factors_of(experiment: Experiment, flags: Iterable[str]) -> dict[str, Factor]:
-    """Return the factors that words of a command line say, "PATH=VALUES" each: values with commas between
-    them, or a distribution with its range."""
+    """Parse the factors of a command line.
+
+    Each flag is "PATH=VALUES": values separated by commas, e.g. "game.rules.freeze-steps=5,25", or a
+    distribution, e.g. "agents.*.algorithm.settings.gamma=uniform(0.5,0.9)".
+    """
     factors: dict[str, Factor] = {}
     for flag in flags:
         path, equals, text = flag.partition("=")
@@ -335,30 +361,35 @@ def factors_of(experiment: Experiment, flags: Iterable[str]) -> dict[str, Factor
 
 
 def _types_at(experiment: Experiment, path: str) -> list[Any]:
-    """Return the annotated types of the places that a path names, `Any` where nothing says them."""
+    """Return the annotated types of the fields that a path means, `Any` for a field without annotation."""
     table = experiment.to_config()
     hints = []
     for holder, name in places(table, path):
-        is_table = isinstance(holder, Mapping)
-        kind = Experiment if holder is table else KINDS.get(holder.get("kind", "")) if is_table else None
-        hints.append(Any if kind in (None, Custom) else hints_of(kind)[name])
+        kind: Any = None
+        if holder is table:
+            kind = Experiment
+        elif isinstance(holder, Mapping):
+            kind = KINDS.get(holder.get("kind", ""))
+        is_typed = kind not in (None, Custom)
+        hint = hints_of(kind)[name] if is_typed else Any
+        hints.append(hint)
     return hints
 
 
 _BETWEEN: Final = re.compile(r",(?![^(]*\))")
-"""A comma that is in no parentheses."""
+"""A comma outside of parentheses."""
 _BY_WORD: Final[Mapping[str, Any]] = {name.lower(): kind for name, kind in DISTRIBUTIONS.items()}
 _DRAWN: Final = re.compile(r"\s*(uniform|log_?uniform|integers)\(([^,]*,[^,]*)\)\s*", re.IGNORECASE)
 _CONSTANTS: Final = {"true": True, "false": False, "none": None}
 
 
 def _value(text: str, hints: Sequence[Any], path: str) -> Any:
-    """Return a value that every place of a path can have; one number may stand for a list of one."""
+    """Parse a value that fits the types of all fields of a path; a number also fits a list of one number."""
     value = _literal(text)
     for candidate in (value, (value,), text):
-        if all(fits(candidate, hint) or (hint is Map and candidate == text) for hint in hints):
+        if all(matches_type(candidate, hint) or (hint is Map and candidate == text) for hint in hints):
             return candidate if hints[0] is Map else checked(path, candidate, hints[0])
-    allowed = " and ".join(map(words, dict.fromkeys(hints)))
+    allowed = " and ".join(map(describe_type, dict.fromkeys(hints)))
     raise ValueError(
         f"at the path {path} is {text!r}; allowed: {allowed}, by what a command line can say; a Study in "
         "Python can have any"
@@ -366,7 +397,7 @@ def _value(text: str, hints: Sequence[Any], path: str) -> Any:
 
 
 def _literal(text: str) -> Any:
-    """Return a text as Python reads it, "8x8" and "8 8" as (8, 8), and as itself where that is nothing."""
+    """Parse a text as a Python literal, and "8x8" or "8 8" as (8, 8); return any other text unchanged."""
     numbers = re.split(r"\s*x\s*|\s+", text)
     try:
         if len(numbers) > 1 and "(" not in text:

@@ -18,16 +18,16 @@ from cprl.pictures.readable import growth_of, meaning_of, rule_of, tag_of
 from cprl.population import learned
 from cprl.runs.curves import curves_of
 from cprl.studies.results import SUMMARY, answer_of
-from cprl.studies.tables.table import StudyTable
+from cprl.studies.tables.tidy_table import StudyTable
 from cprl.system.defaults import SEED, STUDY_TABLE, Fresh
 from cprl.system.output import legible
 from cprl.system.working import working
 from cprl.terminal.course import course_of
 from cprl.terminal.figures import training_curve
-from cprl.terminal.summary import compared
-from cprl.terminal.tables import markdown
+from cprl.terminal.summary import comparison_table
+from cprl.terminal.text_tables import markdown
 from cprl.training.stored import LoadedRun, load
-from cprl.values.arrays import Float64
+from cprl.values.array_types import Float64
 
 _LARGEST_SVG_BYTES: Final = 300_000
 
@@ -50,25 +50,29 @@ def report(
         path: the directory of a run or of a study, or their results.
         out: the page, an .html, complete or absent; by default `report.html` in that directory.
         episodes: of a run alone, fresh ones of each replica.
-        seed: likewise: of their worlds and all chance.
+        seed: of a run alone, the seed of their worlds and all chance.
 
     Raises:
         FileExistsError: if the page exists.
     """
     folder = Path(path)
-    page_path = Page(folder / "report.html" if out is None else out)
+    if out is None:
+        out = folder / "report.html"
+    page_path = Page(out)
     page_path.refuse()
     is_study = (folder / STUDY_TABLE).is_file()
     for name, value, default in (("episodes", episodes, 20), ("seed", seed, SEED)):
         if is_study and value != default:
             raise ValueError(f"{name} is {value}, and {folder} is a study; allowed: of a run alone")
-    text = _of_study(folder) if is_study else _of_run(load(folder), episodes, seed)
+    text = _study_page(folder) if is_study else _run_page(load(folder), episodes, seed)
     page_path.write(text)
     return page_path
 
 
-def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
-    game, name = run.game, legible(run.experiment.name.replace("_", " "))
+def _run_page(run: LoadedRun, episodes: int, seed: int) -> str:
+    """Return the page of a run."""
+    game = run.game
+    name = legible(run.experiment.name.replace("_", " "))
     played = evaluate_run(run, Fresh(episodes=episodes, seed=seed))
     is_commons = isinstance(game, Game)
     data = data_of([fresh_episode(run)])[0] if is_commons else None
@@ -79,15 +83,13 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
         *facts, meaning = course_of(run.path, run.specs).splitlines()
         before.append("  \n".join([*facts, f"**{meaning}**"]))
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
-    before.append(run.experiment.own_code)
+    before.append(run.experiment.custom_code)
     after = [
         "## Fresh episodes, beside random play",
         "",
-        *markdown(compared(played, "", names={"trained": "run's agents"})),
-    ]
-    after += [
+        *markdown(comparison_table(played, "", names={"trained": "run's agents"})),
         "These episodes were played for this page, in other worlds than those above, so that means differ by "
-        f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`."
+        f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`.",
     ]
     sections = [
         _html("\n".join(after)),
@@ -100,7 +102,7 @@ def _of_run(run: LoadedRun, episodes: int, seed: int) -> str:
 
 
 def _curves(run: LoadedRun) -> dict[str, Float64]:
-    """The curves of the training; none of a run that has played no episode."""
+    """Return the curves of the training; none of a run that has played no episode."""
     try:
         return curves_of(run.path)
     except FileNotFoundError:
@@ -108,7 +110,8 @@ def _curves(run: LoadedRun) -> dict[str, Float64]:
 
 
 def _rules(game: Game) -> str:
-    """The institutions in words, what a tag does, and which settings differ from the defaults, as HTML."""
+    """Return the institutions in words, what a tag does, and the settings that differ from the defaults, as
+    HTML."""
     lines = [
         "## Rules",
         "",
@@ -122,7 +125,8 @@ def _rules(game: Game) -> str:
 
 
 def _changed(game: Game) -> str:
-    """The rules that differ from the defaults, for those who program, as HTML that is closed at first."""
+    """Return the rules that differ from the defaults, for those who program, as HTML that is closed at
+    first."""
     changed = game.rules.changed
     if not changed:
         return _html("All other rules: `Rules()`.")
@@ -132,6 +136,7 @@ def _changed(game: Game) -> str:
 
 
 def _recipe(run: LoadedRun) -> str:
+    """Return how to run it again, as HTML."""
     recipe = json.dumps(run.recipe["experiment"], separators=(", ", ": "))
     began = escape(str(run.recipe.get("command", "")))
     return (
@@ -144,22 +149,24 @@ def _recipe(run: LoadedRun) -> str:
 
 
 def _training_figure(run: LoadedRun) -> str:
-    """As SVG, or as PNG where so many lines make an SVG large."""
+    """Return the course of the training as SVG, or as PNG where so many lines make an SVG large."""
+    kind = "svg+xml"
     with TemporaryDirectory() as folder:
         content = training_curve(run.path, title="", path=Path(folder, "course.svg")).read_bytes()
-        is_large = len(content) > _LARGEST_SVG_BYTES
-        if is_large:
+        if len(content) > _LARGEST_SVG_BYTES:
+            kind = "png"
             content = training_curve(run.path, title="", path=Path(folder, "course.png")).read_bytes()
-    return _figure(content, "png" if is_large else "svg+xml", "The course of the training")
+    return _figure(content, kind, "The course of the training")
 
 
-def _of_study(folder: Path) -> str:
+def _study_page(folder: Path) -> str:
+    """Return the page of a study: its summary, with the answer and the figures."""
     table = StudyTable.read(folder / STUDY_TABLE)
     summary = (folder / SUMMARY).read_text(encoding="utf-8")
     title, _, rest = summary.partition("\n")
     answer = answer_of(table)
-    head, found, tail = rest.partition("\n## ")
-    text = f"{head}\n\n**Answer.** {answer}\n{found}{tail}" if answer else rest
+    head, mark, tail = rest.partition("\n## ")
+    text = f"{head}\n\n**Answer.** {answer}\n{mark}{tail}" if answer else rest
 
     def picture(image: re.Match[str]) -> str:
         path = folder / image[1]
@@ -171,11 +178,11 @@ def _of_study(folder: Path) -> str:
 
 
 def _html(text: str) -> str:
-    """Markdown as HTML; HTML in it is text."""
+    """Return Markdown as HTML; HTML in it is text."""
     html: str = MarkdownIt("commonmark", {"html": False}).enable("table").render(text)
     return html.replace("<table>", '<div class="wide"><table>').replace("</table>", "</table></div>")
 
 
-def _figure(content: bytes, kind: str, words: str) -> str:
+def _figure(content: bytes, kind: str, alternative: str) -> str:
     encoded = b64encode(content).decode("ascii")
-    return f'<figure><img src="data:image/{kind};base64,{encoded}" alt="{words}"></figure>'
+    return f'<figure><img src="data:image/{kind};base64,{encoded}" alt="{alternative}"></figure>'

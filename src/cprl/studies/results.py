@@ -1,6 +1,6 @@
-"""write_results: the table of a study, its summary and its figures, made of its finished runs alone.
+"""write_results: write the table of a study, its summary and its figures from its finished runs.
 
-The summary and the figures are made of the table: `summarise_again` makes them again where runs are gone.
+The summary and the figures need the table alone. So `summarise_again` can write them after the runs are gone.
 """
 
 import re
@@ -11,22 +11,29 @@ from pathlib import Path
 from typing import Final
 
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, title, unit
-from cprl.measuring.statistics import Estimate, form_for
+from cprl.measuring.statistics import Estimate, number_format
 from cprl.runs.files import refuse_links, write_atomically
-from cprl.studies.figures import DRAWN, figures_of
 from cprl.studies.study import STATUS, Study
+from cprl.studies.study_figures import DRAWN, figures_of
 from cprl.studies.tables.comparing import (
-    compared_cells,
-    differences_of,
+    compared_metrics,
+    comparison_tables,
+    condition_differences,
     episodes_text,
-    metrics_of,
     pairing_text,
 )
-from cprl.studies.tables.effects import effect_cells, effects_of, weights_of
+from cprl.studies.tables.effects import effect_tables, effect_weights, effects_of
 from cprl.studies.tables.sources import study_table
-from cprl.studies.tables.table import EVALUATION, LAST, RANDOM, TRAINING, WINDOW, StudyTable
+from cprl.studies.tables.tidy_table import (
+    EVALUATION_PART,
+    LAST_EPISODES,
+    RANDOM_PART,
+    TRAINING_PART,
+    WINDOW_EPISODES,
+    StudyTable,
+)
 from cprl.system.defaults import STUDY_TABLE
-from cprl.terminal.tables import Cells, cell, markdown
+from cprl.terminal.text_tables import TextTable, escape_cell, markdown
 
 SUMMARY: Final = "summary.md"
 FIGURES: Final = "figures"
@@ -37,50 +44,59 @@ def write_results(
     out: Path | str,
     runs: Path | str,
     *,
-    window: int = WINDOW,
-    last: int = LAST,
+    window: int = WINDOW_EPISODES,
+    last: int = LAST_EPISODES,
     again: str = "",
 ) -> StudyTable:
-    """Write `table.parquet`, `summary.md` and `figures/`; again over what an earlier call wrote.
+    """Write `table.parquet`, `summary.md` and `figures/` of a study; replace those of an earlier call.
 
     Args:
-        last: episodes at the end of the training that are compared.
-        again: the command line that runs what is lacking, for the summary.
+        out: the directory of the study.
+        runs: the directory of its runs.
+        window: the number of episodes in a window of the table.
+        last: the number of episodes at the end of the training that are compared.
+        again: the command line that runs missing trials; the summary shows it.
 
     Returns:
-        The table. What is no part of it is named in it and in the summary.
+        The table. It names the runs that are missing, and so does the summary.
     """
     out = Path(out)
     refuse_links(out)
     table = replace(study_table(study, runs, window=window, status=out / STATUS), last=last)
     table.windows()  # refuses before anything is written
     table.write(out / STUDY_TABLE)
-    draw(table, out)
+    draw_figures(table, out)
     write_summary(table, out, again=again)
     return table
 
 
 def summarise_again(table: StudyTable, out: Path) -> Path:
-    """Write `summary.md` of a table alone, with an earlier one's line that runs what is lacking, and draw the
-    figures that are there, so that both are of the same episodes and the same reference."""
+    """Write the summary again from a table alone, and draw the figures again if there are any.
+
+    Summary and figures then compare the same episodes with the same reference. The line that runs missing
+    trials is taken from the earlier summary.
+    """
     table.windows()  # refuses before anything is written
     if (out / FIGURES).exists():
-        draw(table, out)
+        draw_figures(table, out)
     earlier = (out / SUMMARY).read_text("utf-8", "replace") if (out / SUMMARY).exists() else ""
-    again = re.search("^This line runs what is lacking.*?: `(.*)`$", earlier, re.MULTILINE)
-    return write_summary(table, out, again=again[1] if again else "")
+    lines = re.findall("^This line runs what is lacking.*?: `(.*)`$", earlier, re.MULTILINE)
+    return write_summary(table, out, again="".join(lines[:1]))
 
 
-def draw(table: StudyTable, out: Path, *, suffix: str = ".png", metrics: Sequence[str] = ()) -> list[Path]:
-    """Draw the figures that fit a study into `figures/`, and return them; those of an earlier call with the
-    same suffix go.
+def draw_figures(
+    table: StudyTable, out: Path, *, suffix: str = ".png", metrics: Sequence[str] = ()
+) -> list[Path]:
+    """Draw the figures of a study into `figures/`, and return their paths.
+
+    Figures of an earlier call with the same suffix that are not drawn again are removed.
 
     Args:
         suffix: ".png", ".pdf" or ".svg".
-        metrics: by default those that are compared.
+        metrics: the metrics that are drawn; by default those that are compared.
     """
     refuse_links(out)
-    metrics_of(table, metrics)  # refuses before anything is drawn
+    compared_metrics(table, metrics)  # refuses before anything is drawn
     figures = {name: draw_it for name, _, draw_it in figures_of(table, suffix=suffix, metrics=metrics)}
     drawn = [draw_it(out / FIGURES / name) for name, draw_it in figures.items()]
     for path in (out / FIGURES).glob(f"*{suffix}"):
@@ -90,35 +106,43 @@ def draw(table: StudyTable, out: Path, *, suffix: str = ".png", metrics: Sequenc
 
 
 def write_summary(table: StudyTable, out: Path, *, again: str = "") -> Path:
-    """Write `summary.md` of a table alone, with the figures that are there; see `write_results`."""
+    """Write `summary.md` from a table, with links to the figures that exist; see `write_results`."""
     design = table.design
     lines = [f"# {design.name}", ""]
     for word, text in (("Question", design.question), ("Expected before it was run", design.expectation)):
         lines += [f"**{word}.** {text}", ""] if text else []
     lines += [table.summary, ""]
-    if table.lacking:
-        damaged = any(run.is_damaged for run in table.lacking)
+    if table.missing_runs:
+        damaged = any(run.is_damaged for run in table.missing_runs)
         what = "what is lacking" + ", damaged runs once their directories are removed" * damaged
         line = f"This line runs {what}: `{again}`" if again else f"Running the study again runs {what}."
-        lines += ["## What is not in these results", "", *(f"- {run}" for run in table.lacking), "", line, ""]
+        lines += [
+            "## What is not in these results",
+            "",
+            *(f"- {run}" for run in table.missing_runs),
+            "",
+            line,
+            "",
+        ]
     if table.metrics:
-        lines += [*_compared(table, TRAINING), *_compared(table, EVALUATION), *_phases(table)]
+        lines += [*_compared(table, TRAINING_PART), *_compared(table, EVALUATION_PART), *_phases(table)]
         figures = [figure for figure in figures_of(table) if (out / FIGURES / figure[0]).exists()]
         lines += ["## Figures", ""] if figures else []
         for name, what, _ in figures:
             lines += [f"![{what}]({FIGURES}/{name})", ""]
-        lines += [*_made(table), *_lengths(table)]
+        lines += [*_provenance(table), *_lengths(table)]
     content = ("\n".join(lines).rstrip() + "\n").encode("utf-8", "replace")
     write_atomically(out / SUMMARY, lambda file: file.write(content))
     return out / SUMMARY
 
 
 def _compared(table: StudyTable, part: str) -> list[str]:
-    tables = compared_cells(table, part=part) + effect_cells(table, part=part)
-    if part == EVALUATION:
-        tables += compared_cells(table, part=RANDOM)[:1]
+    """Return the section of the summary that compares conditions in one part of the runs."""
+    tables = comparison_tables(table, part=part) + effect_tables(table, part=part)
+    if part == EVALUATION_PART:
+        tables += comparison_tables(table, part=RANDOM_PART)[:1]
     agents = "Trained agents" if table.agents_learn else "The agents"
-    lines = ["## Training" if part == TRAINING else f"## {agents} in fresh worlds", ""]
+    lines = ["## Training" if part == TRAINING_PART else f"## {agents} in fresh worlds", ""]
     for each in tables:
         lines += [each.heading, "", *markdown(each)]
     return lines
@@ -129,63 +153,68 @@ def _phases(table: StudyTable) -> list[str]:
     for condition in table.design.conditions:
         counts = table.endings.get(condition, {})
         phases = ", ".join(f"{phase} {number}" for phase, number in counts.items())
-        rows.append(f"| {cell(condition)} | {sum(counts.values())} | {phases or '-'} |")
+        rows.append(f"| {escape_cell(condition)} | {sum(counts.values())} | {phases or '-'} |")
     heading = f"In which phase a replica ends: {'; '.join(table.ending_rules)}."
     return ["## Phases", "", heading, "", *rows, ""]
 
 
-def _made(table: StudyTable) -> list[str]:
-    first = next(iter(table.made.values()), {})
-    lines = [f"- {sentence}" for sentence in table.mixed]
+def _provenance(table: StudyTable) -> list[str]:
+    first = next(iter(table.provenance.values()), {})
+    lines = [f"- {sentence}" for sentence in table.version_warnings]
     lines = lines or [f"All under {', '.join(f'{name} {value}' for name, value in first.items())}."]
     return ["## How the runs were made", "", *lines, ""]
 
 
 def _lengths(table: StudyTable) -> list[str]:
-    ranges = {
-        condition: [table.lengths[condition][name] for name in ("episodes", "steps")]
-        for condition in table.design.conditions
-        if condition in table.lengths
-    }
+    """Return the section of the summary that says how long replicas trained."""
     what = (
         "How long each replica trained. The replicas of a run take each step together until every one has "
         "played its episodes; those whose episodes are short play and learn on, in episodes that are in no "
         "table."
     )
-    if any(least < most for (least, most), _ in ranges.values()):
+    rows = []
+    differ = False
+    for condition in table.design.conditions:
+        lengths = table.lengths.get(condition)
+        if lengths is not None:
+            least, most = lengths["episodes"]
+            differ |= least < most
+            rows.append([condition, _range(least, most), _range(*lengths["steps"])])
+    if differ:
         what += " Where steps are counted, each plays as many as it ends in these."
-    rows = [
-        [condition, *(f"{least:,}" if least == most else f"{least:,} to {most:,}" for least, most in pairs)]
-        for condition, pairs in ranges.items()
-    ]
-    lines = markdown(Cells(what, ["condition", "episodes", "environment steps"], rows))
+    lines = markdown(TextTable(what, ["condition", "episodes", "environment steps"], rows))
     return [what, "", *lines] if rows else []
 
 
-def answer_of(table: StudyTable) -> str:
-    """Return in Markdown what differs in the episodes of the evaluation: of a grid the effects of its
-    factors, else conditions from the reference; "" without any.
+def _range(least: int, most: int) -> str:
+    return f"{least:,}" if least == most else f"{least:,} to {most:,}"
 
-    It is about income where money moves, and then about the harvest too; else about the first metric.
+
+def answer_of(table: StudyTable) -> str:
+    """Return the answer of a study in Markdown: the differences that the evaluation shows or does not show.
+
+    For a grid these are the effects of its factors, otherwise the differences from the reference. They are
+    about income and harvest if money moves, otherwise about the first metric. "" if there is nothing to
+    compare.
     """
     if not table.metrics or len(table.design.conditions) < 2:
         return ""
-    metrics = metrics_of(table, part=EVALUATION)
+    metrics = compared_metrics(table, part=EVALUATION_PART)
     subjects = {INCOME: _INCOME, COLLECTIVE_RETURN: _HARVEST}
     if not subjects.keys() <= set(metrics):
         subjects = {metrics[0]: title(metrics[0])}
-    beside = f"beside {cell(table.design.reference)}, {pairing_text(table)}"
-    family = differences_of(table, metrics, part=EVALUATION)
+    beside = f"beside {escape_cell(table.design.reference)}, {pairing_text(table)}"
+    family = condition_differences(table, metrics, part=EVALUATION_PART)
     tests = f"{family.tests} differences of their table below"
     parts = []
-    for metric, words in subjects.items():
-        if weights_of(table):
-            family = effects_of(table, metric, part=EVALUATION)
+    for metric, subject in subjects.items():
+        if effect_weights(table):
+            family = effects_of(table, metric, part=EVALUATION_PART)
             beside = "effects of each factor over all cells of the grid, paired by replica"
             tests = f"{family.tests} effects on a metric"
         changes = {name: one for (name, number), one in family.items() if number == metric}
-        parts += [f"- {words}:", *_lines(changes, unit(metric))]
-    what = f"In {episodes_text(table, EVALUATION)}, {beside}"
+        parts += [f"- {subject}:", *_lines(changes, unit(metric))]
+    what = f"In {episodes_text(table, EVALUATION_PART)}, {beside}"
     what += f"; by Holm's method for the {tests}:" if family.tests else ":"
     return "\n".join([what, "", *parts])
 
@@ -198,11 +227,13 @@ _UNTOLD: Final = "cannot be told, as one replica has no interval"
 
 
 def _lines(differences: Mapping[str, Estimate], unit_of: str) -> list[str]:
-    """Return lines on which differences are more and less than 0; of those not shown, how large one would
-    have to be."""
+    """Return a line for each verdict: the differences above 0, below 0, and those that are not shown.
+
+    For differences that are not shown, the line says how large they would have to be to show.
+    """
     by_kind: dict[str, list[str]] = {kind: [] for kind in ("more", "less", _NONE, _ALONE, _UNTOLD)}
     for name, one in differences.items():
-        text = f"{cell(name)} {one:+}"
+        text = f"{escape_cell(name)} {one:+}"
         if one.differs:
             kind = "more" if one.value > 0 else "less"
         elif isnan(one.reach):
@@ -211,7 +242,7 @@ def _lines(differences: Mapping[str, Estimate], unit_of: str) -> list[str]:
             kind = _ALONE
         else:
             kind = _NONE
-            size = f"{one.reach:{form_for(one.value, one.low, one.high)}} {unit_of}".rstrip()
+            size = f"{one.reach:{number_format(one.value, one.low, one.high)}} {unit_of}".rstrip()
             text += f" (differences below {size} would not show)" if one.reach else ""
         by_kind[kind].append(text)
     return [f"  - {kind}: {'; '.join(texts)}" for kind, texts in by_kind.items() if texts]

@@ -1,4 +1,4 @@
-"""run_study: every trial of a study, wherever an executor runs it."""
+"""run_study: run all trials of a study that are not finished, and write the results."""
 
 import json
 import time
@@ -13,12 +13,20 @@ from cprl.runs.checkpoints import endings_of
 from cprl.runs.files import RunLock, digest_of, holder_of, remove_partial, write_json
 from cprl.runs.states import state_of
 from cprl.studies.executors import Executor, InProcess
-from cprl.studies.progress import Progress
 from cprl.studies.status import PATIENCE_S, Status, is_silent
-from cprl.studies.study import FILE_NAME, RUNS, STATUS, Study, directory_of, levels_in
-from cprl.studies.tables.comparing import LAST
-from cprl.studies.tables.table import WINDOW, StudyTable
-from cprl.studies.trials import FinishedRuns, Outcome, Task, Trial, is_of_other_code, move_aside, trials_of
+from cprl.studies.study import RUNS, STATUS, STUDY_FILE, Study, directory_of, levels_in
+from cprl.studies.tables.comparing import LAST_EPISODES
+from cprl.studies.tables.tidy_table import WINDOW_EPISODES, StudyTable
+from cprl.studies.trial_progress import Progress
+from cprl.studies.trials import (
+    FinishedRuns,
+    Task,
+    Trial,
+    TrialOutcome,
+    is_of_other_code,
+    move_aside,
+    trials_of,
+)
 from cprl.system.output import say
 from cprl.values import MOST_INT32, Range, checked, refusal
 
@@ -28,17 +36,17 @@ _POLL_S: Final = 1.0
 
 @dataclass(frozen=True, eq=False)
 class StudyResult:
-    """What a study has produced so far."""
+    """The state of a study after a call of `run_study`."""
 
     study: Study
     out: Path
     runs: Path
     """The directory of its runs."""
     trials: tuple[Trial, ...] = field(repr=False)
-    failed: tuple[Outcome, ...]
+    failed: tuple[TrialOutcome, ...]
     """The trials that failed, with their reasons."""
     table: StudyTable | None = field(repr=False)
-    """What came out; None if nothing has finished, and where no results were asked for."""
+    """The table of results; None if nothing has finished, and where no results were asked for."""
 
 
 def run_study(
@@ -51,13 +59,14 @@ def run_study(
     keep_checkpoints: bool = False,
     progress: bool = True,
     results: bool = True,
-    last: int = LAST,
+    last: int = LAST_EPISODES,
     again: str = "",
 ) -> StudyResult:
-    """Run what a study lacks; may be stopped at any moment, and called again.
+    """Run the trials of a study that are not finished yet, and write its results.
 
-    A trial that fails does not end the study. Two processes that run the same study share its trials.
-    Another study in the same directory is refused until they end.
+    You can stop it at any moment; the next call continues. A trial that fails does not end the study. Two
+    processes that run the same study share its trials; meanwhile, another study in the same directory is
+    refused.
 
     Args:
         out: the study's directory, new or of an earlier call; by default `studies/<name>`. A study that
@@ -87,19 +96,18 @@ def run_study(
     tasks = [
         Task(
             trial=trial,
-            runs=folder,
             status=Status(out / STATUS, trial.name),
             keep_checkpoint=keep_checkpoints,
             finished=finished,
         )
         for trial in trials_with(trials, only)
     ]
-    checked("last", last, Annotated[int, Range(WINDOW, MOST_INT32)])
+    checked("last", last, Annotated[int, Range(WINDOW_EPISODES, MOST_INT32)])
     table = None
     with shared(study, out, progress=progress):
         folder.mkdir(parents=True, exist_ok=True)
         failed = _run(tasks, on or InProcess(), study.name, progress=progress) if tasks else ()
-        if results and any(trial.state(folder) == "finished" for trial in trials):
+        if results and any(trial.state() == "finished" for trial in trials):
             from cprl.studies.results import write_results  # with matplotlib
 
             table = write_results(study, out, folder, last=last, again=again)
@@ -107,7 +115,11 @@ def run_study(
 
 
 def trials_with(trials: Sequence[Trial], only: Sequence[str] | None) -> list[Trial]:
-    """Return the trials of conditions that have one of some names, or else its levels; with None, all."""
+    """Return the trials of the chosen conditions; with None, all trials.
+
+    Args:
+        only: names of conditions, or levels that their names contain, e.g. "gamma=0.9".
+    """
     if only is None:
         return list(trials)
     names = list(dict.fromkeys(trial.condition.name for trial in trials))
@@ -123,8 +135,10 @@ def trials_with(trials: Sequence[Trial], only: Sequence[str] | None) -> list[Tri
 
 @contextmanager
 def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
-    """Make a study's directory, and lock it together with all who run the same study; another one is
-    refused."""
+    """Create the directory of a study and lock it while the study runs.
+
+    All processes that run the same study hold the lock together; another study is refused.
+    """
     out.mkdir(parents=True, exist_ok=True)
     table = study.to_config(out)
     with RunLock(out, study=digest_of(json.dumps(table, sort_keys=True), size=6)) as lock:
@@ -135,23 +149,24 @@ def shared(study: Study, out: Path, *, progress: bool) -> Iterator[None]:
                 f"{out} is run by somebody else too, {holder_of(out)}, or was when its host went down: each "
                 "trial is run by the one that begins it first; the other continues with the rest"
             )
-        write_json(out / FILE_NAME, table)
+        write_json(out / STUDY_FILE, table)
         yield
 
 
-def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: bool) -> tuple[Outcome, ...]:
-    """Run trials, show how far they are, and return those that failed.
+def _run(
+    tasks: Sequence[Task], executor: Executor, title: str, *, progress: bool
+) -> tuple[TrialOutcome, ...]:
+    """Run the trials, show their progress, and return those that failed.
 
-    Those that another process runs come last: all others first, then it waits for these. Those that were made
-    with other code of the user's own are moved aside and run anew."""
-    runs = tasks[0].runs
-    status = tasks[0].status.folder
+    Trials that another process is running come last. Runs that were made with another version of the user's
+    own code are moved aside and run anew.
+    """
     moved = move_aside([task.directory for task in tasks if is_of_other_code(task.directory)])
     if moved and progress:
         places = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
         anew = f"{len(moved)} of {len(tasks)} trials are run anew, as the user's own code has changed"
         say(f"{anew}; what was there is kept: {places}")
-    passed_over = _of_another_engine(tasks)
+    passed_over = _runs_of_another_engine(tasks)
     if passed_over and progress:
         anew = f"{len(passed_over)} of {len(tasks)} trials begin with their first episode"
         say(
@@ -163,7 +178,7 @@ def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: boo
     trials = [task.trial for task in tasks]
     failed = []
     with (
-        Progress(trials, runs, status, title=title, is_shown=progress) as table,
+        Progress(trials, tasks[0].status.folder, title=title, is_shown=progress) as table,
         closing(_outcomes(tasks, executor)) as outcomes,
     ):
         try:
@@ -171,27 +186,30 @@ def _run(tasks: Sequence[Task], executor: Executor, title: str, *, progress: boo
                 table.ended(outcome)
                 failed += [outcome] if outcome.state == "failed" else []
         except BaseException as error:
-            states = Counter(trial.state(runs) for trial in trials)
+            states = Counter(trial.state() for trial in trials)
             begun = states["begun"] + states["stopped"]
             error.add_note(
                 f"{states['finished']} of {len(trials)} trials are finished and {begun} begun; all of it is "
-                f"kept in {runs}, and the same study continues from there"
+                f"kept in {trials[0].runs}, and the same study continues from there"
             )
             raise
     return tuple(failed)
 
 
-def _of_another_engine(tasks: Sequence[Task]) -> list[Path]:
-    """Return the shorter runs that trials do not continue because of their engine, if any run can be
-    continued."""
-    finished = (run for run in tasks[0].runs.glob("*") if state_of(run) == "finished")
+def _runs_of_another_engine(tasks: Sequence[Task]) -> list[Path]:
+    """Return the shorter runs that trials could continue if they had been trained by the same engine."""
+    finished = (run for run in tasks[0].trial.runs.glob("*") if state_of(run) == "finished")
     if not any(map(endings_of, finished)):
         return []
-    return [run for task in tasks if (run := task.of_another_engine()) is not None]
+    return [run for task in tasks if (run := task.run_of_another_engine()) is not None]
 
 
-def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, None, None]:
-    """Run all trials, those that other processes run as soon as these have ended or are silent."""
+def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[TrialOutcome, None, None]:
+    """Run all trials, and yield their outcomes.
+
+    A trial that another process is running is tried again until that process has finished it, or has given no
+    sign of life for `PATIENCE_S`; then its lock is taken over.
+    """
     silences = {task.name: is_silent(task.status, PATIENCE_S) for task in tasks}
     left = ready = list(tasks)
     while left:
@@ -206,4 +224,4 @@ def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[Outcome, N
         while left and not ready:
             time.sleep(_POLL_S)
             left = [replace(task, take_over=next(silences[task.name])) for task in left]
-            ready = [task for task in left if task.settled() != Outcome(task.name, "elsewhere")]
+            ready = [task for task in left if task.settled() != TrialOutcome(task.name, "elsewhere")]

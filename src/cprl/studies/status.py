@@ -1,4 +1,8 @@
-"""Status: what a trial says of itself while it runs, in files beside those of its study."""
+"""Status files: a trial that runs writes there, every second, how far it is, and why it failed.
+
+They lie in the directory of the study, since the processes of a study may run on several hosts that share no
+more than a file system.
+"""
 
 import json
 import os
@@ -17,27 +21,28 @@ import psutil
 from tensordict import TensorDictBase
 
 from cprl.experiment import Experiment
-from cprl.measuring.episodes import Episode
+from cprl.measuring.tracker import Episode
 from cprl.runs.files import RunLockedError, write_json
 from cprl.system.process import cpu
 from cprl.system.times import CLOCK, Speed
 from cprl.training import Training
 
 PATIENCE_S: Final = 60.0
-"""Seconds without a sign of life after which a trial is taken over that another host has locked."""
+"""Seconds without a sign of life after which the lock of a process on another host is taken over."""
 BEAT_S: Final = 1.0
-"""Seconds between two signs of life."""
+"""Seconds between two signs of life of a trial."""
 LOCKED: Final = 75
-"""The exit code of a process whose trial another one runs; EX_TEMPFAIL of sysexits.h."""
+"""The exit code of a process whose trial another process is running; EX_TEMPFAIL of sysexits.h."""
 STOPPED: Final = (128 + signal.SIGINT, 128 + signal.SIGTERM)
 """The exit codes of a process that was asked to stop, and saved a checkpoint."""
 
 
 class Status:
-    """The files in which a trial says how far it is.
+    """The status files of a trial.
 
     Args:
-        folder: in which they are; the first that writes makes it.
+        folder: the folder of the files; writing creates it.
+        name: the name of the trial.
     """
 
     def __init__(self, folder: Path, name: str) -> None:
@@ -48,7 +53,7 @@ class Status:
         self.failed = folder / f"{name}.failed.txt"
 
     def read(self) -> dict[str, Any]:
-        """Return what the trial said last; empty if it has said nothing."""
+        """Return the last status that the trial wrote; empty if it has written none."""
         try:
             table = json.loads(self.path.read_bytes())
         except (OSError, ValueError):
@@ -56,12 +61,13 @@ class Status:
         return table if isinstance(table, dict) else {}
 
     def fail(self, reason: str, trace: str) -> None:
+        """Write the reason of a failure, in the first line, and its trace."""
         with suppress(OSError):  # of a full disk, say; then the reason is in the outcome alone
             self.folder.mkdir(parents=True, exist_ok=True)
             self.failed.write_text(f"{reason}\n\n{trace}", encoding="utf-8", errors="replace")
 
     def failure(self) -> str | None:
-        """Return the error of the last attempt in a line; None if it did not fail."""
+        """Return the reason why the last attempt failed; None if it did not fail."""
         try:
             return self.failed.read_text(encoding="utf-8").partition("\n")[0]
         except (OSError, ValueError):
@@ -75,8 +81,8 @@ class Status:
 
 @contextmanager
 def process_of_trial(path: Path, experiment: Experiment) -> Iterator["StatusFile"]:
-    """Make this process one that a study started: it says in a file how far it is, and by its exit code that
-    another process runs the trial."""
+    """Report to the study that started this process: status in a file, and exit code `LOCKED` if another
+    process is running the trial."""
     with StatusFile(Status(path.parent, path.stem), experiment) as status:
         try:
             yield status
@@ -86,8 +92,10 @@ def process_of_trial(path: Path, experiment: Experiment) -> Iterator["StatusFile
 
 
 class StatusFile:
-    """Writes every second how far a trial is, and why it failed; a context manager around the run, and
-    a callback of `cprl.training`."""
+    """Writes the status of a trial every second, and the reason if it fails.
+
+    It is a context manager around the run, and a callback of the training.
+    """
 
     is_extendable = True
 
@@ -104,8 +112,7 @@ class StatusFile:
         }
         self._began = time.monotonic()
         self._compiled_s = CLOCK.total_s
-        self._worlds = experiment.worlds
-        self._length = experiment.length
+        self._experiment = experiment
         self._speed = Speed()
         """How fast episodes are played since this process began to train."""
         self._is_over = Event()
@@ -131,6 +138,7 @@ class StatusFile:
             self.write()
 
     def write(self) -> None:
+        """Write the status now; the changed "beat" is a sign of life."""
         self._table["beat"] += 1
         running_s = time.monotonic() - self._began
         compiling_s = CLOCK.total_s - self._compiled_s
@@ -152,22 +160,27 @@ class StatusFile:
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Count the steps of a replica: a turn of each of its worlds."""
-        self._count(self._table["steps"] + self._worlds, self._table["episodes"])
+        self._count(self._table["steps"] + self._experiment.worlds, self._table["episodes"])
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         self._count(self._table["steps"], self._table["episodes"] + 1)
 
     def _count(self, steps: int, episodes: int) -> None:
-        """Of a training of so many steps, the episodes that count are that share of those expected."""
-        if self._length.is_of_steps:
-            episodes = self._table["of"] * steps // self._length.number
+        """Store the progress of the training.
+
+        A training whose length is in steps has no fixed number of episodes. Its "episodes" are the share of
+        the steps that is done, times the number of episodes that is expected.
+        """
+        length = self._experiment.length
+        if length.is_of_steps:
+            episodes = self._table["of"] * steps // length.number
         self._table.update(steps=steps, episodes=episodes)
 
 
 def is_silent(status: Status, patience_s: float) -> Iterator[bool]:
-    """Return whether a trial has given no sign of life for so many seconds, each time it is asked.
+    """Yield, each time it is advanced, whether a trial has given no sign of life for some seconds.
 
-    Other hosts' clocks may differ from this one's, so what counts is whether the status changes.
+    It watches whether the status changes, since the clocks of other hosts may differ from this one.
     """
     last = status.read()
     since = time.monotonic()
@@ -180,7 +193,7 @@ def is_silent(status: Status, patience_s: float) -> Iterator[bool]:
 
 
 def peak_bytes() -> int:
-    """Return the largest memory that this process has had, in bytes."""
+    """Return the peak memory of this process in bytes."""
     if sys.platform == "win32":
         return int(psutil.Process().memory_info().peak_wset)
     import resource

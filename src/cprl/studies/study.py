@@ -1,4 +1,8 @@
-"""Study: one experiment under several conditions, each repeated by the same replicas; a value."""
+"""Study: an experiment that is run under several conditions, with the same replicas in each.
+
+`Study` describes the conditions, and `Condition` is one of them. A study is a frozen value: it can be stored
+as `study.json` and read again (`read_study`), and running it is the business of `cprl.studies.run`.
+"""
 
 import json
 from collections.abc import Container, Iterable, Iterator, Mapping
@@ -11,56 +15,56 @@ from typing import Annotated, Any, Final, Literal, TypeAlias
 from cprl.experiment.engine import engine_of
 from cprl.experiment.experiment import MOST_SEED, Experiment
 from cprl.runs.files import STUDY_FORMAT, digest_of, read_json, refuse_newer
-from cprl.runs.recipe import RECIPE_FILE, stored_experiment, with_runs_moved
+from cprl.runs.recipe import RECIPE_FILE, with_runs_moved
 from cprl.studies.factors import (
     MOST_CONDITIONS,
     Design,
     Factor,
     Level,
-    changed,
+    all_combinations,
     changes_from_config,
     changes_to_config,
     checked_factors,
-    drawn,
+    draw_combinations,
     factor_from_config,
     factor_to_config,
-    grid,
+    with_changes,
 )
-from cprl.system.defaults import BLOCK
+from cprl.system.defaults import REPLICAS_PER_RUN
 from cprl.values import (
     DirectoryName,
     Range,
     Value,
-    meant,
+    did_you_mean,
     refusal,
     refuse_live,
-    shown,
+    short_repr,
     without_defaults,
-    without_departed,
 )
 
 CONDITION_FORMAT: Final = 1
-"""Of checksums: counted up when a default of any value of `cprl.values.KINDS`, or of `Experiment`, changes,
-so that the same checksum never means two things."""
-UNNAMED: Final = ("name", "seed", "replicas", "on_nan")
-"""Fields of an experiment that its checksum leaves out: what it is called, which repetitions of it a run
-holds, and what happens where a number is not finite."""
-SEEDS_APART: Final = 1000
-"""Between the seeds of two blocks of replicas; evaluation plays worlds of the next seed."""
+"""The version of the checksum. Increase it when a default of `Experiment` or of a value in
+`cprl.values.KINDS` changes: checksums leave defaults out, so the same checksum would mean two experiments."""
+NOT_IN_CHECKSUM: Final = ("name", "seed", "replicas", "on_nan")
+"""The fields of an experiment that its checksum leaves out, because they do not decide its numbers: its name,
+the seed and number of the replicas, and what happens at a number that is not finite."""
+BLOCK_SEED_STEP: Final = 1000
+"""The difference between the seeds of two blocks. It is more than 1, because the evaluation of a run uses
+the seed after the run's own."""
 CONDITION: Final = "condition"
-"""The column of named conditions."""
+"""The column of a table that holds the names of named conditions."""
 UNCHANGED: Final = "unchanged"
-"""The one condition of a study without factors."""
+"""The name of the only condition of a study without factors."""
 
 
 @dataclass(frozen=True, eq=False)
 class Condition:
-    """One experiment of a study.
+    """A condition of a study: the experiment that is trained, and how it differs from other conditions.
 
     Args:
-        experiment: what is trained; its seed and replicas are those of the study.
-        levels: the level of each factor, by factor: a value, or the name of a level.
-        name: what it is called, unique in its study.
+        experiment: the experiment; the study decides its seed and its replicas.
+        levels: the level of each factor, by the factor's path: a value, or the name of a level.
+        name: the name of the condition, unique in its study.
     """
 
     experiment: Experiment
@@ -69,35 +73,39 @@ class Condition:
 
     @cached_property
     def checksum(self) -> str:
-        """Of all that decides its numbers but the seed: 12 hexadecimal digits.
+        """Return 12 hexadecimal digits that identify everything that decides the numbers, except the seed.
 
-        Fields that have their default are left out, so that a later version, which has further ones, gives
-        the same.
+        Fields with their default value are left out. So a later version of cprl, which may have more fields,
+        computes the same checksum.
         """
         return self.checksum_in(".")
 
     def checksum_in(self, runs: Path | str) -> str:
-        """Return the checksum in the names of its runs in a directory: what runs of `Frozen` agents are
-        called from there, so that it is the same wherever the study is run from."""
+        """Return the checksum for runs in a directory.
+
+        `Frozen` agents name the run that they come from by its path. The checksum uses paths relative to the
+        directory, so that it does not depend on the working directory.
+        """
         config = with_runs_moved(self.experiment.to_config(), ".", runs)
         config["engine"] = engine_of(self.experiment)
-        table = {name: value for name, value in config.items() if name not in UNNAMED}
-        named = without_defaults(table, Experiment)
-        if named["engine"] == "compiled":  # the default when the format began
-            del named["engine"]
-        content = {"format": CONDITION_FORMAT, "experiment": named}
+        table = {name: value for name, value in config.items() if name not in NOT_IN_CHECKSUM}
+        differing = without_defaults(table, Experiment)
+        if differing["engine"] == "compiled":  # the default when the format began
+            del differing["engine"]
+        content = {"format": CONDITION_FORMAT, "experiment": differing}
         return digest_of(json.dumps(content, sort_keys=True), size=6)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Block:
-    """Replicas of a condition that one run trains side by side."""
+    """The replicas of a condition that a single run trains."""
 
     first: int
-    """The number of the first one in the study."""
+    """The number of the block's first replica, counted over the whole study."""
     replicas: int
+    """The number of replicas in the block."""
     seed: int
-    """Of the run."""
+    """The seed of the run."""
 
 
 Replicas: TypeAlias = Annotated[int, Range(1, 2**20)]
@@ -105,23 +113,27 @@ Replicas: TypeAlias = Annotated[int, Range(1, 2**20)]
 
 @dataclass(frozen=True, eq=False)
 class Study(Value, stored=False):
-    """One experiment under several conditions: a grid, random draws, or named conditions.
+    """An experiment under several conditions: all combinations of factors, random draws, or named conditions.
 
     Args:
-        experiment: what every condition is, but for what it changes.
-        factors: by the path of a field (see `cprl.studies.factors`), its values; or by a name of your own, a
-            table of levels, each a table of values by path; or a distribution, with `draws`.
-        conditions: named ones instead of factors, each a table of values by path; `{}` changes nothing.
-        draws: so many random combinations of the factors' levels instead of their grid.
-        design: how they are drawn: "random", each by itself; "latin_hypercube", the range of each factor
-            evenly; or "sobol", all ranges together evenly, however many are drawn.
-        replicas: of each condition; by default as many as in the experiment.
-        block: replicas that one run trains side by side; fewer can be spread over more processes.
-        reference: the name of the condition that others are compared with; by default the first one that
-            changes nothing, else the first.
-        name: by default the experiment's.
-        question: what the study asks, for its report.
-        expectation: what was expected before it was run, for its report.
+        experiment: the experiment that all conditions start from.
+        factors: the values to try for each field, by the field's path, see `cprl.studies.factors`. Instead of
+            a list of values, a factor may be a table of named levels, each a table of values by path, or,
+            with `draws`, a distribution.
+        conditions: named conditions instead of factors: for each name a table of values by path. The empty
+            table `{}` is the unchanged experiment.
+        draws: the number of random combinations to draw, instead of running all combinations.
+        design: the way to draw them: "random" draws each combination independently; "latin_hypercube" covers
+            the range of each factor evenly; "sobol" covers all ranges together evenly, for any number of
+            draws.
+        replicas: the number of replicas of each condition; by default that of the experiment.
+        block: the largest number of replicas that one run trains together. With smaller blocks, more
+            processes can share the work.
+        reference: the name of the condition that the others are compared with; by default the first condition
+            that equals the experiment, or else the first of all.
+        name: the name of the study; by default that of the experiment.
+        question: what the study asks; the report quotes it.
+        expectation: what you expected before the study was run; the report quotes it.
     """
 
     experiment: Experiment
@@ -130,7 +142,7 @@ class Study(Value, stored=False):
     draws: Annotated[int, Range(1, MOST_CONDITIONS)] | None = field(default=None, kw_only=True)
     design: Design = field(default="random", kw_only=True)
     replicas: Replicas | None = field(default=None, kw_only=True)
-    block: Replicas = field(default=BLOCK, kw_only=True)
+    block: Replicas = field(default=REPLICAS_PER_RUN, kw_only=True)
     reference: str | None = field(default=None, kw_only=True)
     name: DirectoryName | Literal[""] = field(default="", kw_only=True)
     question: str = field(default="", kw_only=True)
@@ -166,6 +178,7 @@ class Study(Value, stored=False):
 
     @cached_property
     def all_conditions(self) -> tuple[Condition, ...]:
+        """Return the conditions, each with its experiment and a name of its own."""
         by_checksum: dict[str, Condition] = {}
         assert self.replicas is not None
         base = replace(self.experiment, replicas=self.replicas)
@@ -182,35 +195,35 @@ class Study(Value, stored=False):
                 f"draws is {self.draws}; the factors have no more than {len(by_checksum)} combinations that "
                 "differ, or this design finds no more"
             )
-        return apart(by_checksum.values())
+        return with_unique_names(by_checksum.values())
 
     def _levels(self) -> Iterator[tuple[str, dict[str, Level]]]:
-        """Yield the name and levels of each condition; of draws more than are asked for, as some may be
-        equal."""
+        """Yield the name and levels of each condition. Random draws yield more than `draws` of them, since
+        some may be equal."""
         if self.conditions:
             yield from ((name, {CONDITION: Level(name, levels)}) for name, levels in self.conditions.items())
         elif not self.factors:
             yield UNCHANGED, {CONDITION: Level(UNCHANGED, {})}
         else:
             short = short_names(self.factors)
-            seed = self.experiment.seed
-            draws = self.draws
-            combinations = (
-                grid(self.factors)
-                if draws is None
-                else drawn(self.factors, draws, seed=seed, design=self.design)
-            )
+            combinations: Iterable[dict[str, Level]]
+            if self.draws is None:
+                combinations = all_combinations(self.factors)
+            else:
+                seed = self.experiment.seed
+                combinations = draw_combinations(self.factors, self.draws, seed=seed, design=self.design)
             for levels in combinations:
-                yield named({short[factor]: level.value for factor, level in levels.items()}), levels
+                yield condition_name({short[factor]: level.value for factor, level in levels.items()}), levels
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
+        """Return the blocks of replicas. Every condition has a run for each block."""
         assert self.replicas is not None
         return tuple(
             Block(
                 first=first,
                 replicas=min(self.block, self.replicas - first),
-                seed=self.experiment.seed + SEEDS_APART * (first // self.block),
+                seed=self.experiment.seed + BLOCK_SEED_STEP * (first // self.block),
             )
             for first in range(0, self.replicas, self.block)
         )
@@ -226,12 +239,16 @@ class Study(Value, stored=False):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Return the names of the factors; of named conditions "condition" alone."""
+        """Return the paths of the factors, or ("condition",) where conditions have names instead."""
         return tuple(self.factors) if self.factors else (CONDITION,)
 
     def to_config(self, directory: str | Path | None = None) -> dict[str, Any]:
-        """Return the study as JSON can hold it; in a directory, runs of `Frozen` agents are given relative to
-        it."""
+        """Return the study as a table that JSON can hold.
+
+        Args:
+            directory: where the table will be stored. Paths of the runs of `Frozen` agents are relative to
+                it.
+        """
         table: dict[str, Any] = {
             "experiment": self.experiment.to_config(),
             "factors": {name: factor_to_config(factor) for name, factor in self.factors.items()},
@@ -249,17 +266,17 @@ class Study(Value, stored=False):
 
     @classmethod
     def from_config(cls, table: Mapping[str, Any], *, directory: str | Path | None = None) -> "Study":
-        """Return the study that `to_config` gave in a directory."""
+        """Return the study of a table that `to_config` returned, stored in the directory."""
         refuse_newer("the study", table, STUDY_FORMAT)
         if table.get("format") != STUDY_FORMAT:
             raise refusal("the study's format", table.get("format"), str(STUDY_FORMAT))
         known = ("format", "experiment", "factors", "conditions", *_PLAIN)
         if unknown := [name for name in table if name not in known]:
-            close = meant(unknown[0], known)
-            raise ValueError(f"the study has no {shown(unknown[0])}{close}; allowed: {', '.join(known)}")
+            close = did_you_mean(unknown[0], known)
+            raise ValueError(f"the study has no {short_repr(unknown[0])}{close}; allowed: {', '.join(known)}")
         try:
-            values = {"experiment": stored_experiment(table["experiment"])}
-            values |= {name: without_departed(dict(table[name])) for name in ("factors", "conditions")}
+            values = {"experiment": {**table["experiment"]}}
+            values |= {name: dict(table[name]) for name in ("factors", "conditions")}
             if directory is not None:
                 values = with_runs_moved(values, directory, ".")
             experiment = Experiment.from_config(values["experiment"])
@@ -278,11 +295,12 @@ class Study(Value, stored=False):
 
 
 _PLAIN: Final = ("name", "question", "expectation", "draws", "design", "replicas", "block", "reference")
-"""Fields that JSON can hold as they are."""
+"""The fields of a study that its table holds unchanged."""
 
 
 def experiment_at(experiment: Experiment, levels: Mapping[str, Level]) -> Experiment:
-    """Return an experiment with what a level of each factor changes."""
+    """Return the experiment with the changes of one level of each factor; refuse levels that contradict each
+    other."""
     paths = [path for level in levels.values() for path in level.changes]
     if len(set(paths)) < len(paths):
         raise ValueError(f"two factors change the same field, of {', '.join(paths)}; allowed: one each")
@@ -290,80 +308,94 @@ def experiment_at(experiment: Experiment, levels: Mapping[str, Level]) -> Experi
     if refused:
         raise ValueError(f"a factor is {refused[0]}, which the study itself decides; allowed: other fields")
     changes = {path: value for level in levels.values() for path, value in level.changes.items()}
-    return changed(experiment, changes) if changes else experiment
+    return with_changes(experiment, changes) if changes else experiment
 
 
-BETWEEN: Final = ", "
-"""Between the levels in the name of a condition."""
+LEVEL_SEPARATOR: Final = ", "
+"""The separator of the levels in the name of a condition."""
 
 
-def named(levels: Mapping[str, Any]) -> str:
+def condition_name(levels: Mapping[str, Any]) -> str:
     """Return the name of a condition, e.g. "freeze_steps=5, gamma=0.9"."""
-    return BETWEEN.join(f"{name}={level_text(value)}" for name, value in levels.items())
+    return LEVEL_SEPARATOR.join(f"{name}={level_text(value)}" for name, value in levels.items())
 
 
-def apart(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
-    """Return conditions with a number after their name where others have the same, e.g. of unlike agents."""
+def with_unique_names(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
+    """Return the conditions with unique names: a condition whose name is taken gets a number, e.g. "DQN #2".
+
+    Names can be equal because they tell only the class and the first field of a value.
+    """
     conditions = tuple(conditions)
     taken = {condition.name for condition in conditions}
     by_name: dict[str, Condition] = {}
     for condition in conditions:
-        name = unlike(condition.name, taken) if condition.name in by_name else condition.name
+        name = unique_name(condition.name, taken) if condition.name in by_name else condition.name
         taken.add(name)
         by_name[name] = condition if name == condition.name else replace(condition, name=name)
     return tuple(by_name.values())
 
 
-def unlike(name: str, taken: Container[str]) -> str:
-    """Return a name that is not taken: itself, or with the lowest number from 2 on that is free."""
+def unique_name(name: str, taken: Container[str]) -> str:
+    """Return the name, or with the lowest free number behind it if it is taken, e.g. "beam #2"."""
     numbered = (f"{name} #{number}" for number in count(2))
     return next(free for free in chain([name], numbered) if free not in taken)
 
 
 def levels_in(name: str) -> list[str]:
-    """Return the levels in the name of a condition; brackets, of a tuple or an agent, hold one together."""
+    """Return the levels in the name of a condition, e.g. ["cells=(8, 8)", "gamma=0.9"].
+
+    Commas within brackets, of a tuple or an agent, do not separate levels.
+    """
     levels: list[str] = []
-    depth = 0
-    for part in name.split(BETWEEN):
-        if depth:
-            levels[-1] += BETWEEN + part
+    open_brackets = 0
+    for part in name.split(LEVEL_SEPARATOR):
+        if open_brackets:
+            levels[-1] += LEVEL_SEPARATOR + part
         else:
             levels.append(part)
-        depth = max(0, depth + sum((sign in "([{") - (sign in ")]}") for sign in part))
+        opened = sum((character in "([{") - (character in ")]}") for character in part)
+        open_brackets = max(0, open_brackets + opened)
     return levels
 
 
 def level_text(value: Any) -> str:
-    """Return a level in a few words, for names and figures: a dataclass by its class and its first field that
-    is no switch, if that says more, e.g. "Learning(DQN)", "MLP((8, 8))"."""
+    """Return a short text for a level, for names of conditions and for figures.
+
+    A dataclass is named by its class and its first field that is no bool, e.g. "Learning(DQN)" or
+    "MLP((8, 8))".
+    """
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, tuple):
         return f"({', '.join(map(level_text, value))})"
     if not is_dataclass(value) or isinstance(value, type):
-        return value if isinstance(value, str) else shown(value)
+        return value if isinstance(value, str) else short_repr(value)
     kind = type(value).__name__
     values = (getattr(value, part.name) for part in fields(value))
     first = next((part for part in values if not isinstance(part, bool)), "")
     inner = type(first).__name__ if is_dataclass(first) else level_text(first)
-    says_no_more = first is None or not inner or inner.startswith(kind)  # as DQNSettings of DQN
-    return kind if says_no_more else f"{kind}({inner})"
+    is_redundant = first is None or not inner or inner.startswith(kind)  # e.g. DQN(DQNSettings)
+    return kind if is_redundant else f"{kind}({inner})"
 
 
 def short_names(factors: Iterable[str]) -> dict[str, str]:
-    """Return the last word of each path, or the whole path where it is a number or several share it."""
+    """Return a short name for each path: its last part, or the whole path where that is a number or not
+    unique."""
     last = {path: path.rpartition(".")[2] for path in factors}
-    words = list(last.values())
-    return {path: path if word.isdigit() or words.count(word) > 1 else word for path, word in last.items()}
+    names = list(last.values())
+    return {path: path if name.isdigit() or names.count(name) > 1 else name for path, name in last.items()}
 
 
-FILE_NAME: Final = "study.json"
-RUNS, STATUS = "runs", "status"
-"""Folders of a study's directory."""
+STUDY_FILE: Final = "study.json"
+RUNS: Final = "runs"
+"""The folder of the runs in a study's directory."""
+STATUS: Final = "status"
+"""The folder of what the trials say of themselves in a study's directory."""
 
 
 def directory_of(study: Study, out: Path | str | None) -> Path:
-    """Return the directory of a study, by default `studies/<name>`."""
+    """Return the directory of a study, by default `studies/<name>`; refuse a file and the directory of a
+    run."""
     directory = Path("studies") / study.name if out is None else Path(out)
     allowed = "a new directory, or the directory of an earlier study"
     if directory.exists() and not directory.is_dir():
@@ -374,8 +406,8 @@ def directory_of(study: Study, out: Path | str | None) -> Path:
 
 
 def read_study(out: Path | str) -> Study:
-    """Return the study of a directory."""
-    path = Path(out) / FILE_NAME
+    """Read the study that is stored in a directory."""
+    path = Path(out) / STUDY_FILE
     try:
         table = read_json(path)
     except (OSError, ValueError) as error:

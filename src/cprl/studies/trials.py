@@ -1,9 +1,9 @@
-"""Trials: runs of a study, one for each condition and block of replicas, each in a directory of its own.
+"""Trials: the runs of a study, one for each condition and block of replicas, each in its own directory.
 
-The truth of a study lies in these directories. A trial is begun when its recipe is written there; from then
-on `cprl run DIRECTORY --resume` makes a finished run of it, in a process of its own, whatever was there:
-nothing but the recipe, or a run that was killed at any moment. `Task` is that process, from its command line
-to what came of it.
+The state of a study is read from these directories alone. `Trial` says which run belongs to a directory. A
+trial has begun when its recipe is in the directory. From then on `cprl run DIRECTORY --resume` finishes it,
+whether it holds the recipe alone or a run that was killed at any moment. `Task` runs that command, or its
+equivalent in this process, and says what came of it.
 """
 
 import json
@@ -24,15 +24,15 @@ from cprl.experiment.engine import engine_of
 from cprl.population import Frozen, partners_in, with_stored
 from cprl.runs.checkpoints import endings_of
 from cprl.runs.files import (
-    FREE,
     LOCK_FILE,
+    NEUTRAL_FIELDS,
     REPORT,
     RunLock,
     RunLockedError,
+    break_hard_links,
     digest_of,
     refuse_missing,
     remove_partial,
-    take_apart,
 )
 from cprl.runs.length import Length, without_length
 from cprl.runs.recipe import (
@@ -41,31 +41,35 @@ from cprl.runs.recipe import (
     recipe_config,
     write_on_nan,
 )
-from cprl.runs.states import State, depends_on_episodes, start, state_of
+from cprl.runs.states import RunState, depends_on_episodes, start, state_of
 from cprl.studies.status import LOCKED, STOPPED, Status, StatusFile
 from cprl.studies.study import Block, Condition, Study
-from cprl.system.output import printed
-from cprl.system.shipped import cprl_here
-from cprl.values import custom_targets, differences, trust, trusted, without_defaults
+from cprl.system.output import quote_command
+from cprl.system.shipped import cprl_command
+from cprl.values import custom_targets, describe_changes, trust, trusted, without_defaults
 
-DirectoryState = Literal[State, "refused"]
-"""Of its directory; "refused" is a run of another trial, or of none that can be read."""
+DirectoryState = Literal[RunState, "refused"]
+"""The state of a trial's directory; "refused" is a run of another trial, or of none that can be read."""
 ATTEMPTS: Final = 5
-"""How often a trial is tried whose process dies."""
+"""Times that a trial is tried whose process dies."""
 
 
 @dataclass(frozen=True, eq=False)
 class Trial:
-    """One run of a study: a block of replicas of a condition."""
+    """A run of a study: one block of replicas of one condition."""
 
     condition: Condition
     block: Block
     runs: Path = Path()
-    """The directory in which the trial's is."""
+    """The directory that holds the directories of all trials."""
 
     @cached_property
     def experiment(self) -> Experiment:
-        """Return what is run; stored agents play in its replicas, which a run numbers from 0 again."""
+        """Return the experiment of the run.
+
+        A run numbers its replicas from 0. So `Frozen` agents, which name a stored replica for each replica of
+        the study, get those of this block.
+        """
         first = self.block.first
         last = self.block.first + self.block.replicas
 
@@ -76,55 +80,60 @@ class Trial:
                 return replace(stored, replica=tuple(range(first, last)))
             return stored
 
-        of_condition = self.condition.experiment
-        agents = tuple(with_stored(spec, in_block) for spec in of_condition.agents)
+        experiment = self.condition.experiment
+        agents = tuple(with_stored(spec, in_block) for spec in experiment.agents)
         return replace(
-            of_condition,
+            experiment,
             seed=self.block.seed,
             replicas=self.block.replicas,
             agents=agents,
-            engine=engine_of(of_condition),
+            engine=engine_of(experiment),
         )
 
     @cached_property
     def checksum(self) -> str:
+        """Return the checksum of the condition for runs in this directory."""
         return self.condition.checksum_in(self.runs)
 
     @property
     def name(self) -> str:
-        """Return the name of its directory: the condition's checksum, the seed and the number of replicas."""
+        """Return the name of the trial's directory: checksum of the condition, seed, number of replicas."""
         return f"{self.checksum}-s{self.experiment.seed}-r{self.experiment.replicas}"
 
     @property
     def label(self) -> str:
-        """Its condition, and which replicas of it, for people."""
+        """Return a name for people, e.g. "gamma=0.9, replicas 0-7"."""
         first = self.block.first
         last = self.block.first + self.block.replicas - 1
         numbers = f"replica {first}" if first == last else f"replicas {first}-{last}"
         return f"{self.condition.name}, {numbers}"
 
-    def state(self, runs: Path) -> DirectoryState:
-        """Return what its directory holds."""
-        run = runs / self.name
-        state = state_of(run)
+    @property
+    def directory(self) -> Path:
+        return self.runs / self.name
+
+    def state(self) -> DirectoryState:
+        """Return the state of the trial's directory."""
+        state = state_of(self.directory)
         try:
             if state != "missing":
-                self.refuse_another(run)
+                self.refuse_another()
         except ValueError:
             return "refused"
         return state
 
-    def refuse_another(self, run: Path) -> None:
-        """Refuse a run that is not this trial, e.g. one that was renamed or restored from a backup.
+    def refuse_another(self) -> None:
+        """Refuse a directory that holds another run, e.g. one that was renamed or restored from a backup.
 
-        One that has not finished may have fewer episodes, or steps: a shorter run, copied to be continued.
+        A run that is not finished may be shorter than the trial: it is a copy that will be continued.
         """
+        run = self.directory
         stored = recipe_config(read_recipe(run))
-        wanted = self.experiment.to_recipe(run)["experiment"]
+        expected = self.experiment.to_recipe(run)["experiment"]
         may_grow = Length.of(stored).is_shorter_than(self.experiment.length)
         may_grow = may_grow and state_of(run) != "finished"
-        free = without_length(FREE) if may_grow else FREE
-        if differ := differences({**stored, **free}, {**wanted, **free}, "experiment", Experiment):
+        free = without_length(NEUTRAL_FIELDS) if may_grow else NEUTRAL_FIELDS
+        if differ := describe_changes({**stored, **free}, {**expected, **free}, "experiment", Experiment):
             raise ValueError(
                 f"{run} was started as another trial than its name says: {differ[0]}; give it back its name, "
                 "or move it away"
@@ -132,17 +141,17 @@ class Trial:
 
 
 def trials_of(study: Study, runs: Path | str = ".") -> list[Trial]:
-    """Return every trial of a study: the first blocks of all conditions, then their second ones, and so on.
+    """Return all trials of a study: the first block of every condition, then the second blocks, and so on.
 
     Args:
-        runs: the directory in which theirs are, on which their names depend where stored agents play.
+        runs: the directory of their runs. The names of trials with `Frozen` agents depend on it.
     """
     runs = Path(runs)
     return [Trial(condition, block, runs) for block in study.blocks for condition in study.all_conditions]
 
 
 def is_of_other_code(run: Path) -> bool:
-    """Return whether a run was made with other code of the user's own than is there now."""
+    """Return whether the user's own code has changed since the run was made."""
     try:
         return state_of(run) != "missing" and bool(changed_code(read_recipe(run)))
     except ValueError:  # its recipe cannot be read, which is a failure of the trial
@@ -150,10 +159,10 @@ def is_of_other_code(run: Path) -> bool:
 
 
 def move_aside(runs: Sequence[Path]) -> list[Path]:
-    """Move runs out of the way, into a folder beside theirs, `runs-earlier`, and return where they are now.
+    """Move runs into a folder beside theirs, e.g. `runs-earlier`, and return their new directories.
 
     Raises:
-        RunLockedError: where another process writes one of them; then none is moved.
+        RunLockedError: if another process writes one of them. Then none is moved.
     """
     for run in runs:
         with RunLock(run):
@@ -162,6 +171,7 @@ def move_aside(runs: Sequence[Path]) -> list[Path]:
 
 
 def _move_aside(run: Path) -> Path:
+    """Move one run as `move_aside` does, under a name that is free."""
     earlier = Path(os.path.abspath(run.parent))
     earlier = earlier.with_name(f"{earlier.name}-earlier")
     with RunLock(run):
@@ -173,21 +183,25 @@ def _move_aside(run: Path) -> Path:
     return aside
 
 
-class Outcome(NamedTuple):
+class TrialOutcome(NamedTuple):
+    """The outcome of a trial."""
+
     name: str
     state: Literal["finished", "failed", "elsewhere"]
-    """"elsewhere" while another process runs it."""
+    """"elsewhere" means that another process is running the trial."""
     reason: str = ""
-    """Of a failure: the error in a line."""
+    """The error of a failure, in a line."""
     worked: bool = False
-    """Whether anything had to be done."""
+    """True if the trial was run; False if it was finished already."""
     command: str = ""
-    """Of a failure: the command line that repeats the trial by hand."""
+    """The command line that repeats a failed trial by hand."""
 
 
 class FinishedRuns:
-    """Finds the finished runs of a directory that are the same experiment but for its length; reads the
-    recipe of each run once."""
+    """An index of the finished runs in a directory, to find runs of an experiment that differ in length only.
+
+    It reads the recipe of each run once, since a study may have thousands.
+    """
 
     def __init__(self, runs: Path) -> None:
         self._runs = runs
@@ -195,7 +209,7 @@ class FinishedRuns:
         self._by_content: dict[str, list[Path]] = {}
 
     def like(self, config: Mapping[str, Any]) -> list[Path]:
-        """Return those of an experiment, in the order of their names."""
+        """Return the finished runs of an experiment of any length, ordered by name."""
         for path in self._runs.glob("*"):
             if path.name not in self._read and state_of(path) == "finished":
                 self._read.add(path.name)
@@ -206,25 +220,23 @@ class FinishedRuns:
 
 
 def _content_of(config: Mapping[str, Any]) -> str:
-    """Return what tells experiments from others that differ in more than their length."""
-    table = without_defaults(without_length({**config, **FREE}), Experiment)
+    """Return a digest that is equal for experiments that differ in their length only."""
+    table = without_defaults(without_length({**config, **NEUTRAL_FIELDS}), Experiment)
     return digest_of(json.dumps(table, sort_keys=True))
 
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
-    """A trial in its directory, and the process that makes a finished run of it."""
+    """The work on a trial: preparing its directory, running it, and finding out how it ended."""
 
     trial: Trial
-    runs: Path
-    """The directory in which the trial's is."""
     status: Status
+    finished: FinishedRuns
+    """The index of finished runs, shared by all tasks of a study."""
     keep_checkpoint: bool = False
-    """Whether the finished run keeps the state of its training, so that a longer trial can go on from it."""
+    """True if the finished run keeps the state of its training, so that a longer trial can continue it."""
     take_over: bool = False
-    """Whether the lock is taken that a process on another host left behind."""
-    finished: FinishedRuns | None = None
-    """The finished runs of the directory, which the tasks of a study share."""
+    """True if the lock of a process on another host, which gives no sign of life, is taken over."""
 
     @property
     def name(self) -> str:
@@ -232,21 +244,22 @@ class Task:
 
     @property
     def directory(self) -> Path:
-        return self.runs / self.name
+        return self.trial.directory
 
     @property
     def recipe(self) -> dict[str, Any]:
-        """Return what the trial's directory says that it is."""
+        """Return the recipe that is stored in the trial's directory."""
         return self.trial.experiment.to_recipe(self.directory)
 
     @property
     def targets(self) -> tuple[str, ...]:
-        """Return the user's own code that it may import: of this experiment, and what this process trusts."""
+        """Return the user's own code that the trial may import: that of the experiment, and all that this
+        process trusts."""
         return tuple(dict.fromkeys([*custom_targets(self.recipe["experiment"]), *trusted()]))
 
     @property
-    def words(self) -> list[str]:
-        """Return what stands after `cprl` on the command line that runs it."""
+    def command_words(self) -> list[str]:
+        """Return the words after `cprl` on the command line that runs the trial."""
         allow = [word for target in self.targets for word in ("--allow", target)]
         keep = "--keep-checkpoint" if self.keep_checkpoint else "--no-keep-checkpoint"
         experiment = self.trial.experiment
@@ -256,66 +269,73 @@ class Task:
 
     @property
     def command(self) -> str:
-        return printed([*cprl_here(), *self.words])
+        """Return the command line that runs the trial, quoted for a shell."""
+        return quote_command([*cprl_command(), *self.command_words])
 
     @property
     def arguments(self) -> list[str]:
-        """Return what stands after Python on the command line of its process."""
-        return ["-m", "cprl", *self.words, "--trial", os.path.abspath(self.status.path)]
+        """Return the arguments of Python in the trial's process."""
+        return ["-m", "cprl", *self.command_words, "--trial", os.path.abspath(self.status.path)]
 
     @property
     def variables(self) -> dict[str, str]:
-        """Variables of its process, which imports what this one does from where this one does."""
+        """Return environment variables with which the process imports the same modules as this one."""
         return {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))}
 
-    def of_another_engine(self) -> Path | None:
-        """Return the shorter run from which the trial would begin if engine="auto" stood for the engine that
-        trained it; None where there is none such, and where the trial has begun."""
+    def run_of_another_engine(self) -> Path | None:
+        """Return a shorter run that the trial could continue if it used the same engine; else None.
+
+        With engine="auto" the engine depends on the length, so a longer trial may use another one.
+        """
         if self.trial.condition.experiment.engine != "auto" or self.directory.exists():
             return None
-        finished = self.finished or FinishedRuns(self.runs)
         config = self.recipe["experiment"]
-        engines = sorted({"eager", "compiled"} - {config["engine"]})
-        shorter = [_longest_shorter({**config, "engine": engine}, finished) for engine in engines]
-        return None if _longest_shorter(config, finished) else shorter[0]
+        if _longest_shorter(config, self.finished):
+            return None
+        other = "compiled" if config["engine"] == "eager" else "eager"
+        return _longest_shorter({**config, "engine": other}, self.finished)
 
-    def settled(self) -> Outcome | None:
-        """Return what there is to say of a trial that cannot be run now: a finished one, one in whose
-        directory another trial's run is, or a finished one that lost a file; None of one that can."""
+    def settled(self) -> TrialOutcome | None:
+        """Return the outcome of a trial that need not or cannot be run, and None for any other.
+
+        Such a trial is finished or runs elsewhere, or its directory is damaged or holds another run.
+        """
         return self._tried(self._check)
 
-    def begin(self) -> Outcome | None:
-        """Make the directory ready for `cprl run`; an outcome where there is nothing to be run."""
+    def begin(self) -> TrialOutcome | None:
+        """Prepare the directory for `cprl run`; return an outcome if there is nothing to run."""
         return self._tried(self._check) or self._tried(self._prepare)
 
-    def _tried(self, step: Callable[[], Outcome | None]) -> Outcome | None:
+    def _tried(self, step: Callable[[], TrialOutcome | None]) -> TrialOutcome | None:
         try:
             return step()
         except RunLockedError:
-            return Outcome(self.name, "elsewhere")
+            return TrialOutcome(self.name, "elsewhere")
         except Exception as error:
             return self.failed(f"{type(error).__name__}: {error}", traceback.format_exc())
 
-    def _check(self) -> Outcome | None:
+    def _check(self) -> TrialOutcome | None:
+        """Return the outcome of a finished trial; refuse a directory that is in use or holds another run."""
         run = self.directory
-        state = state_of(self.directory)
+        state = state_of(run)
         if state != "missing":
-            self.trial.refuse_another(run)
+            self.trial.refuse_another()
         if state == "finished":
             refuse_missing(run)
             self.status.tidy_up()
-            return Outcome(self.name, "finished")
+            return TrialOutcome(self.name, "finished")
         if run.exists():
             with RunLock(run, take_over=self.take_over):
                 pass
         return None
 
-    def _prepare(self) -> Outcome | None:
+    def _prepare(self) -> TrialOutcome | None:
+        """Write the recipe, or copy a shorter run; return an outcome if another process was faster."""
         run = self.directory
         experiment = self.trial.experiment
         self.status.folder.mkdir(parents=True, exist_ok=True)
         self.status.tidy_up()
-        take_apart(self.status.log)
+        break_hard_links(self.status.log)
         with open(self.status.log, "a", encoding="utf-8") as log:
             log.write(f"$ {self.command}\n")
         if not run.exists():
@@ -333,16 +353,20 @@ class Task:
         except FileExistsError:
             if state_of(run) == "missing" and not (run / LOCK_FILE).exists():
                 raise
-            return Outcome(self.name, "elsewhere")  # somebody else has begun it
+            return TrialOutcome(self.name, "elsewhere")  # somebody else has begun it
         return None
 
-    def ended(self, code: int) -> Outcome | None:
-        """Return the outcome where its process ended with an exit code; None where it died or was stopped."""
+    def ended(self, code: int) -> TrialOutcome | None:
+        """Return the outcome after the process ended; None if it died or was stopped and may be resumed.
+
+        Args:
+            code: the exit code; negative for a signal.
+        """
         if state_of(self.directory) == "finished":
             self.status.tidy_up()
-            return Outcome(self.name, "finished", worked=True)
+            return TrialOutcome(self.name, "finished", worked=True)
         if code == LOCKED:
-            return Outcome(self.name, "elsewhere")
+            return TrialOutcome(self.name, "elsewhere")
         if code < 0 or code in STOPPED:
             return None
         reason = self.status.failure()
@@ -351,22 +375,25 @@ class Task:
         lines = self.status.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
         return self.failed(f"{lines[-1].strip()} (exit code {code})", "\n".join(lines[-100:]))
 
-    def given_up(self) -> Outcome:
+    def given_up(self) -> TrialOutcome:
+        """Return the outcome of a trial whose process died in every attempt."""
         reason = (
             f"its process died, {ATTEMPTS} times; one that is killed is often one for which memory was short"
         )
         return self.failed(reason, f"What it printed is in {self.status.log}.")
 
-    def failed(self, reason: str, trace: str = "") -> Outcome:
+    def failed(self, reason: str, trace: str = "") -> TrialOutcome:
+        """Return the outcome of a failed trial, and write the trace to its status files."""
         if trace:
             self.status.fail(reason, trace)
-        return Outcome(self.name, "failed", reason, worked=True, command=self.command)
+        return TrialOutcome(self.name, "failed", reason, worked=True, command=self.command)
 
-    def run_here(self) -> Outcome:
-        """Run the trial in this process, as `cprl run` does in one of its own."""
-        return self.begin() or self._tried(self._run) or Outcome(self.name, "finished", worked=True)
+    def run_here(self) -> TrialOutcome:
+        """Run the trial in this process."""
+        return self.begin() or self._tried(self._run) or TrialOutcome(self.name, "finished", worked=True)
 
     def _run(self) -> None:
+        """Run the experiment in the trial's directory, with its output in the trial's log."""
         from cprl.training.running import run
 
         name = str(read_recipe(self.directory)["experiment"]["name"])  # perhaps that of another study
@@ -390,7 +417,7 @@ class Task:
 
 
 def _longest_shorter(config: Mapping[str, Any], finished: FinishedRuns) -> Path | None:
-    """Return the longest run that is the same experiment but shorter, and can be extended."""
+    """Return the longest finished run that is a shorter version of an experiment and can be extended."""
     beginnings = []
     for other in finished.like(config):
         stored = read_recipe(other)
@@ -402,17 +429,20 @@ def _longest_shorter(config: Mapping[str, Any], finished: FinishedRuns) -> Path 
 
 
 def begin_from_shorter(
-    run: Path, experiment: Experiment, recipe: Mapping[str, Any], finished: FinishedRuns | None = None
+    run: Path, experiment: Experiment, recipe: Mapping[str, Any], finished: FinishedRuns
 ) -> Path | None:
-    """Make a run that is not there of the longest finished one beside it that has fewer episodes, keeps the
-    state of its training and is the same otherwise; it is then to be resumed with its own episodes.
+    """Begin a run as a copy of the longest shorter run of the same experiment, which resuming then extends.
 
-    Returns the run that was copied, which stays as it is; None if there is none such, and where callbacks may
-    depend on the number of episodes. A copy that was interrupted is made anew."""
+    The shorter run must have kept the state of its training. It stays as it is. A copy that was interrupted
+    is made anew.
+
+    Returns:
+        The run that was copied; None if there is none, or if a callback may depend on the number of episodes.
+    """
     callbacks = [callback.resolve() for callback in experiment.callbacks]
     if any(not isinstance(callback, type) or depends_on_episodes(callback) for callback in callbacks):
         return None
-    shorter = _longest_shorter(recipe["experiment"], finished or FinishedRuns(run.parent))
+    shorter = _longest_shorter(recipe["experiment"], finished)
     if shorter is None:
         return None
     copying = run.with_name(f".{run.name}.copying-{os.getpid()}")

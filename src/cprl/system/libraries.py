@@ -1,6 +1,6 @@
 """What an upgrade of a library has taken away, said by name: the part, its version, and those that fit.
 
-`cprl.system.compat` and `cprl.commons.compiled` use private parts of libraries through this.
+`cprl.system.compat` and `cprl.commons` use private parts of libraries through this.
 """
 
 import logging
@@ -44,10 +44,10 @@ def fitting_versions(library: str) -> str:
     from packaging.requirements import Requirement
 
     try:
-        wanted = [Requirement(text) for text in requires("cprl") or []]
+        requirements = map(Requirement, requires("cprl") or [])
     except PackageNotFoundError:
-        wanted = []
-    return next((str(each.specifier) for each in wanted if each.name.lower() == library), "")
+        return ""
+    return next((str(each.specifier) for each in requirements if each.name.lower() == library), "")
 
 
 def _installed(library: str) -> str:
@@ -68,9 +68,10 @@ def quiet_in_notebooks() -> None:
 
 
 def when_imported(name: str, call: Callable[[], object]) -> None:
-    """Call a function as soon as a module is imported: now if it is, else once it has been.
+    """Call a function once a module has been imported: now, or after its import.
 
-    What cprl tells a library costs nothing where nobody uses that library.
+    So games are registered with Gymnasium and PettingZoo, which cprl does not import unless somebody uses
+    them; Gymnasium 1.0 took its entry points away, and PettingZoo has none.
     """
     if name in sys.modules:
         call()
@@ -79,10 +80,11 @@ def when_imported(name: str, call: Callable[[], object]) -> None:
 
 
 class _Waiting:
-    """Finds a module as Python does without it, and calls a function behind its import."""
+    """A finder that leaves a module to the other finders, and calls a function after its import."""
 
     def __init__(self, name: str, call: Callable[[], object]) -> None:
-        self._name, self._call = name, call
+        self._name = name
+        self._call = call
         self._is_looking = False
 
     def find_spec(
@@ -90,7 +92,7 @@ class _Waiting:
     ) -> ModuleSpec | None:
         if fullname != self._name or self._is_looking:
             return None
-        self._is_looking = True
+        self._is_looking = True  # the other finders are asked by the same function as this one
         try:
             spec = find_spec(fullname)
         finally:

@@ -18,7 +18,9 @@ def _is_device(value: Any) -> bool:
     import torch
 
     try:
-        return isinstance(value, str) and str(torch.device(value)) == value != "meta"  # cuda:300 becomes 44
+        return (
+            isinstance(value, str) and str(torch.device(value)) == value != "meta"
+        )  # cuda:300 would become cuda:44
     except (RuntimeError, ValueError):
         return False
 
@@ -27,7 +29,7 @@ Device = Annotated[str, Where(_is_device, '"cpu", "cuda:0"')]
 
 
 class TooLargeError(ValueError, MemoryError):
-    """What would take more memory than is free; nothing of it has been allocated."""
+    """A request for more memory than is free; nothing has been allocated."""
 
 
 def free_bytes(device: "str | torch.device" = "cpu") -> int:
@@ -40,12 +42,13 @@ def free_bytes(device: "str | torch.device" = "cpu") -> int:
 
 
 def check_memory(what: str, needed: int, instead: str, *, device: "str | torch.device" = "cpu") -> None:
-    """Refuse what would not fit, where memory is granted at once and missing only when it is written.
+    """Refuse a request that would not fit into memory, before the system grants it and fails at the first
+    write.
 
     Args:
-        what: What takes the memory, in the plural.
-        needed: How many bytes it takes, estimated.
-        instead: What to use in its place.
+        what: what takes the memory, in the plural.
+        needed: the estimated bytes.
+        instead: what to use in its place.
     """
     free = free_bytes(device)
     if needed > free:
@@ -53,5 +56,5 @@ def check_memory(what: str, needed: int, instead: str, *, device: "str | torch.d
 
 
 def gib(size: int) -> str:
-    """Return a number of bytes in GiB, for people."""
+    """Return a number of bytes as text in GiB."""
     return f"{size / 2**30:,.2f} GiB" if size < 2**70 else f"more than {2**40:,} GiB"

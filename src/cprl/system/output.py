@@ -13,22 +13,22 @@ from unicodedata import category
 if TYPE_CHECKING:
     from rich.console import Console
 
-PLAIN: Final = str.maketrans(
+PLAIN_CHARACTERS: Final = str.maketrans(
     {"±": "+-", "\u00d7": "x", "…": "...", "\u2013": "-", "\u2014": "-", "\u2212": "-"}
 )
-"""What stands for characters that the output cannot show; others become question marks."""
+"""Plain characters for those that the output cannot show; others become question marks."""
 
 _ODD: Final = ("Cc", "Cs")
-"""Of control characters, and of bytes that are no text, as Unicode calls them."""
-RESUMES: Final = "To resume: "
-"""What stands before the command line that resumes a run."""
+"""The categories of Unicode of control characters, and of bytes that are no text."""
+RESUME_PREFIX: Final = "To resume: "
+"""The words before the command line that resumes a run."""
 
 
 class Output:
-    """The standard output of the moment, which may be missing, in characters that it has.
+    """The current standard output or error, written in characters that its encoding has; it may be missing.
 
     Args:
-        stream: gives the stream, or None where there is none.
+        stream: returns the current stream, or None if there is none.
     """
 
     def __init__(self, stream: Callable[[], TextIO | None]) -> None:
@@ -49,7 +49,7 @@ class Output:
         return stream.fileno()
 
     def write(self, text: str) -> int:
-        """Writes, in plainer characters where the stream does not have these."""
+        """Write a text, in plainer characters where the encoding lacks some."""
         LINE.erase()
         stream = self._stream()
         if stream is not None:
@@ -57,7 +57,7 @@ class Output:
                 stream.write(text)
             except UnicodeEncodeError:
                 encoding = self.encoding
-                stream.write(text.translate(PLAIN).encode(encoding, "replace").decode(encoding))
+                stream.write(text.translate(PLAIN_CHARACTERS).encode(encoding, "replace").decode(encoding))
         return len(text)
 
     def flush(self) -> None:
@@ -66,13 +66,13 @@ class Output:
             stream.flush()
 
 
-def _behind(stream: TextIO | None) -> TextIO | None:
-    """The stream itself where a progress bar of Rich stands before it."""
+def _unwrapped(stream: TextIO | None) -> TextIO | None:
+    """Return the stream itself if a progress bar of Rich has replaced it."""
     return getattr(stream, "rich_proxied_file", stream)
 
 
-OUT: Final = Output(lambda: _behind(sys.stdout))
-ERR: Final = Output(lambda: _behind(sys.stderr))
+OUT: Final = Output(lambda: _unwrapped(sys.stdout))
+ERR: Final = Output(lambda: _unwrapped(sys.stderr))
 
 
 def in_notebook() -> bool:
@@ -82,7 +82,7 @@ def in_notebook() -> bool:
 
 
 class NotebookLine:
-    """A line of a notebook that is written over, also in a notebook that is executed unseen."""
+    """A line of a notebook's output that is overwritten, also where the notebook runs without a browser."""
 
     def __init__(self) -> None:
         self._handle: Any = None
@@ -97,16 +97,16 @@ class NotebookLine:
 
 
 class Line:
-    """A line on standard error that is written over, and vanishes; what is written on `OUT` or `ERR` erases
-    it before."""
+    """A status line on standard error that is overwritten and vanishes; text on `OUT` or `ERR` erases it
+    first."""
 
     def __init__(self) -> None:
-        self._shown = ""
+        self._text = ""
         self._in_notebook: NotebookLine | None = None
 
     @property
     def is_over_written(self) -> bool:
-        """Whether there is a terminal or a notebook to show it."""
+        """Return whether there is a terminal or a notebook, where the line can be overwritten."""
         return in_notebook() or ERR.isatty()
 
     def show(self, text: str) -> None:
@@ -115,20 +115,20 @@ class Line:
             self._in_notebook.show(text)
             return
         width = shutil.get_terminal_size().columns - 1
-        shown = text[:width]
-        before = len(self._shown)
-        self._shown = ""  # else it would be erased
-        ERR.write(f"\r{shown.ljust(before)}")
+        text = text[:width]
+        before = len(self._text)
+        self._text = ""  # so that writing does not erase it
+        ERR.write(f"\r{text.ljust(before)}")
         ERR.flush()
-        self._shown = shown
+        self._text = text
 
     def erase(self) -> None:
         if self._in_notebook is not None:
             self._in_notebook.show("")
             self._in_notebook = None
-        if self._shown:
-            blank = " " * len(self._shown)
-            self._shown = ""
+        if self._text:
+            blank = " " * len(self._text)
+            self._text = ""
             ERR.write(f"\r{blank}\r")
             ERR.flush()
 
@@ -137,13 +137,13 @@ LINE: Final = Line()
 
 
 def console(output: Output = OUT, *, width: int | None = None) -> "Console":
-    """A console that no encoding can stop, by default on standard output; square brackets and colons in
-    texts, which may be those of a path, are shown as they are."""
+    """Return a console of Rich that works with any encoding, by default on standard output. It shows square
+    brackets and colons, which may be part of a path, unchanged."""
     from rich.console import Console
     from rich.text import Text
 
     class Plain(Console):
-        """Shows no text that a terminal would take for a command."""
+        """A console without characters that a terminal would take for a command."""
 
         def render_str(self, text: str, **options: Any) -> Text:
             return super().render_str(legible(text), **options)
@@ -152,8 +152,8 @@ def console(output: Output = OUT, *, width: int | None = None) -> "Console":
 
 
 def legible(text: str) -> str:
-    """Return a text, which may be the name of a file or of anything in a file of somebody else, as one that
-    UTF-8 can hold and that no terminal takes for a command; lines stay."""
+    """Return an untrusted text, such as the name of a file, without control characters and with what UTF-8
+    lacks replaced; line breaks stay."""
     return "".join("?" if category(letter) in _ODD and letter not in "\n\t" else letter for letter in text)
 
 
@@ -162,6 +162,6 @@ def say(*what: object) -> None:
     OUT.flush()
 
 
-def printed(words: Sequence[str]) -> str:
-    """A command line to be copied, quoted for the shell of this platform."""
+def quote_command(words: Sequence[str]) -> str:
+    """Return a command line quoted for the shell of this platform."""
     return subprocess.list2cmdline(words) if sys.platform == "win32" else shlex.join(words)

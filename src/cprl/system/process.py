@@ -1,4 +1,4 @@
-"""Settings of the process in which a training runs, and the type of processor that it runs on."""
+"""Settings of the process that trains: threads, signals, memory, and folders of compiled code."""
 
 import ctypes
 import logging
@@ -24,15 +24,15 @@ _MAX_THRESHOLD_BYTES: Final = 32 * 2**20
 
 
 def prepare_process(seed: int, *, threads: int = 1) -> None:
-    """Prepares the process for a training.
+    """Prepare the process for a training.
 
-    Seeds torch's global generator, sets the number of torch's threads, flushes denormal numbers to zero,
-    makes glibc reuse freed memory, keeps what torch compiles in `cache_folder` unless
-    $TORCHINDUCTOR_CACHE_DIR says where, and logs warnings of TorchRL and messages of cprl.
+    Seed torch's global generator, set the number of torch's threads, flush denormal numbers to zero, make
+    glibc reuse freed memory, keep what torch compiles in `cache_folder` unless
+    $TORCHINDUCTOR_CACHE_DIR says where, and log warnings of TorchRL and messages of cprl.
 
-    The networks are so small that a second thread slows them down, up to a hundredfold on a busy machine,
-    unless minibatches are large, of many worlds, and nothing else wants the cores. Denormal numbers in Adam's
-    moments of dead weights slow a long run by a factor of up to 1.9.
+    The networks are so small that a second thread slows them down, up to a hundredfold on a busy machine.
+    Large minibatches of many worlds are the exception, if no other program needs the cores. Denormal numbers
+    in Adam's moments of dead weights slow a long run by a factor of up to 1.9.
     """
     import torch
 
@@ -49,33 +49,39 @@ def prepare_process(seed: int, *, threads: int = 1) -> None:
 
 
 @contextmanager
-def at_signals(call: Callable[[int], object], *numbers: signal.Signals) -> Iterator[None]:
-    """Call a function with its number at a signal in the block, by default at SIGINT and SIGTERM.
+def on_signals(handler: Callable[[int], object], *signals: signal.Signals) -> Iterator[None]:
+    """Call a function with the number of each signal that arrives in the block.
 
-    Python handles signals in the main thread alone; in other threads handlers stay as they are.
+    Python handles signals in the main thread only; in other threads this does nothing.
+
+    Args:
+        handler: the function.
+        signals: the signals to handle; by default SIGINT and SIGTERM.
     """
 
-    def handle(number: int, frame: FrameType | None) -> None:
-        call(number)
+    def handle(signal_number: int, frame: FrameType | None) -> None:
+        handler(signal_number)
 
-    handled = (numbers or (signal.SIGINT, signal.SIGTERM)) if current_thread() is main_thread() else ()
-    usual = {number: signal.signal(number, handle) for number in handled}
+    previous_handlers = {}
+    if current_thread() is main_thread():
+        for number in signals or (signal.SIGINT, signal.SIGTERM):
+            previous_handlers[number] = signal.signal(number, handle)
     try:
         yield
     finally:
-        for number, handler in usual.items():
-            signal.signal(number, handler)
+        for number, previous in previous_handlers.items():
+            signal.signal(number, previous)
 
 
 def obey_parent() -> None:
-    """Make this process obey the one at the other end of its standard input, a pipe: each byte is a SIGTERM,
-    and it ends when nobody is left to write any."""
+    """Make this process obey its parent, which writes into its standard input: each byte acts as a SIGTERM,
+    and the end of the pipe ends the process."""
     Thread(target=_obey, args=(sys.stdin.fileno(),), daemon=True).start()
 
 
 def _obey(pipe: int) -> None:
     while os.read(pipe, 1):
-        if sys.platform == "win32":  # where os.kill ends the process at once, without its handler
+        if sys.platform == "win32":  # os.kill would end the process without its handler
             signal.raise_signal(signal.SIGTERM)
         else:
             os.kill(os.getpid(), signal.SIGTERM)
@@ -84,7 +90,8 @@ def _obey(pipe: int) -> None:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Lets torch compute in one thread, as trainings do: the last bits of products depend on their number."""
+    """Let torch compute in one thread within the block, as trainings do: results differ in their last bits
+    with the number of threads."""
     import torch
 
     threads = torch.get_num_threads()
@@ -97,7 +104,7 @@ def one_thread() -> Iterator[None]:
 
 @cache
 def cpu() -> str:
-    """The type of this machine's processor; numbers may differ in the last bits on another."""
+    """Return the name of this machine's processor; results may differ in their last bits on another."""
     with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace").splitlines():
             name, _, value = line.partition(":")
@@ -107,7 +114,7 @@ def cpu() -> str:
 
 
 def _keep_freed_memory() -> None:
-    """Makes glibc keep the memory that a step frees, up to the limit of glibc's own dynamic adjustment.
+    """Make glibc keep the memory that a training step frees, up to the limit of its dynamic adjustment.
 
     Otherwise, depending on the layout of the heap, glibc may return its end to the system after each step and
     request it again in the next, page by page.
@@ -119,8 +126,8 @@ def _keep_freed_memory() -> None:
 
 
 def _keep_compiled_code() -> None:
-    """Makes torch keep compiled code where the rules' is, and not in the folder for temporary files, which
-    many machines empty when they start."""
+    """Store code that torch compiles in cprl's cache folder, beside the compiled rules of the game. Torch's
+    default, the folder for temporary files, is emptied when many machines start."""
     folder = cache_folder() / "torch"
     with suppress(OSError):
         folder.mkdir(parents=True, exist_ok=True)
@@ -129,7 +136,7 @@ def _keep_compiled_code() -> None:
 
 
 def cache_folder() -> Path:
-    """$CPRL_CACHE, or the folder cprl in the user's cache folder."""
+    """Return the folder of compiled code: $CPRL_CACHE, or else "cprl" in the user's cache folder."""
     if "CPRL_CACHE" in os.environ:
         return Path(os.environ["CPRL_CACHE"])
     return Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "cprl"

@@ -1,4 +1,4 @@
-"""Where the time of a training goes, in seconds, and how fast it is; CLOCK: compiling in this process."""
+"""Clocks: the seconds of a training by what they are spent on, its speed, and time spent compiling."""
 
 import time
 from collections.abc import Iterator, Mapping
@@ -36,7 +36,8 @@ class CompileClock:
             with working(f"compiling {what}", before_s=self._spent_s):
                 yield
         finally:
-            self._spent_s, self._began = self.total_s, None
+            self._spent_s = self.total_s
+            self._began = None
 
     @property
     def is_running(self) -> bool:
@@ -44,7 +45,7 @@ class CompileClock:
 
     @property
     def total_s(self) -> float:
-        """Seconds of all compilations so far, the one under way included."""
+        """Return the seconds of all compilations so far, the one under way included."""
         began = self._began
         return self._spent_s + (0.0 if began is None else time.perf_counter() - began)
 
@@ -53,15 +54,15 @@ CLOCK: Final = CompileClock()
 
 
 def running_s() -> float:
-    """Return the seconds of a clock that stands still while code is compiled."""
+    """Return the time in seconds by a clock that stands still while code is compiled."""
     return time.perf_counter() - CLOCK.total_s
 
 
 class Speed:
-    """How fast something is counted, by a clock that stands still while code is compiled.
+    """The speed of a count, by a clock that stands still while code is compiled.
 
     Args:
-        count: How many there are already; they took no time.
+        count: the count so far, which took no time.
     """
 
     def __init__(self, count: float = 0) -> None:
@@ -70,26 +71,26 @@ class Speed:
 
     @property
     def waited_s(self) -> float:
-        """Seconds since the last `lap`."""
+        """Return the seconds since the last `lap`."""
         return running_s() - self._then
 
     def lap(self, count: float) -> float:
-        """Return how many came per second since the last lap, of so many by now; NaN for no time."""
+        """Return the count per second since the last lap, given the count now; NaN if no time has passed."""
         waited_s = self.waited_s
-        came = count - self._last
+        since_then = count - self._last
         self._then += waited_s
         self._last = count
-        return came / waited_s if waited_s > 0 else nan
+        return since_then / waited_s if waited_s > 0 else nan
 
     def mean(self, count: float) -> float | None:
-        """Return how many came per second from the beginning on; None if none came."""
+        """Return the count per second since the beginning; None if nothing was counted."""
         spent_s = running_s() - self._began
-        came = count - self._before
-        return came / spent_s if came > 0 and spent_s > 0 else None
+        counted = count - self._before
+        return counted / spent_s if counted > 0 and spent_s > 0 else None
 
 
 class Times:
-    """The time that something takes from now on; of a training what it took before it was stopped, too.
+    """The times of a training or a run from now on, with those before it was stopped.
 
     Attributes:
         busy_s: seconds of acting, storing and updating, compiling included: those of `with times:` blocks.
@@ -106,21 +107,21 @@ class Times:
 
     @property
     def spent_s(self) -> float:
-        """Seconds of everything."""
+        """Return all seconds so far."""
         return self._before_s["spent_s"] + time.monotonic() - self._began
 
     @property
     def compiling_s(self) -> float:
-        """Seconds in which code was compiled, or read from torch's and Numba's caches."""
+        """Return the seconds in which code was compiled, or read from torch's and Numba's caches."""
         return self._before_s["compiling_s"] + CLOCK.total_s - self._compiled_s
 
     @property
     def acting_storing_updating_s(self) -> float:
-        """Seconds of acting, storing and updating alone, the game included."""
+        """Return the seconds of acting, storing and updating alone, the game included."""
         return max(0.0, self.busy_s - self.compiling_s)
 
     def report(self, training: "Times") -> dict[str, float]:
-        """The entries of `report.json` for a run and its training."""
+        """Return the entries of `report.json` for a run and its training."""
         return {
             "training_s": round(training.spent_s, 1),
             "acting_storing_updating_s": round(training.acting_storing_updating_s, 3),
@@ -132,6 +133,7 @@ class Times:
         return {"spent_s": self.spent_s, "compiling_s": self.compiling_s, "busy_s": self.busy_s}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self._began, self._compiled_s = time.monotonic(), CLOCK.total_s
+        self._began = time.monotonic()
+        self._compiled_s = CLOCK.total_s
         self._before_s = {name: float(state[name]) for name in ("spent_s", "compiling_s")}
         self.busy_s = float(state["busy_s"])

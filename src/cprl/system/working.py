@@ -1,7 +1,7 @@
-"""working: says on standard error what the process does, where that takes more than a second.
+"""Say on standard error what the process does, if it takes more than a second.
 
-On a terminal and in a notebook it is one line, which is written over and vanishes; elsewhere a line every two
-seconds. Nothing is said of what ends within a second, or while something shows a progress of its own.
+On a terminal and in a notebook this is one line, which is overwritten and vanishes; elsewhere a line every
+two seconds. Nothing is printed within the first second, or while another progress bar is shown.
 """
 
 import time
@@ -13,15 +13,15 @@ from typing import Final
 from cprl.system.output import ERR, LINE
 
 FIRST_S: Final = 0.8
-"""Seconds before the first word."""
+"""Seconds before the first line."""
 PERIOD_S: Final = 2.0
 """Seconds from one line to the next."""
 LINE_PERIOD_S: Final = 0.25
-"""Seconds after which a line that is written over is written anew."""
+"""Seconds between updates of a line that is overwritten."""
 
 
 class Work:
-    """Something that takes a while.
+    """A piece of work that may take a while.
 
     Args:
         what: what is done, e.g. "playing an episode".
@@ -33,7 +33,7 @@ class Work:
         self._began = time.monotonic() - before_s
         self.thread = get_ident()
         self.counted: tuple[int, int | None, str] | None = None
-        """How much of it is done, of how much if that is known, and what is counted."""
+        """The count so far, the total if it is known, and the unit."""
 
     def __str__(self) -> str:
         if self.counted is None:
@@ -43,17 +43,17 @@ class Work:
 
 
 _works: Final[list[Work]] = []
-"""What is under way, each part of that before it."""
+"""The work in progress, each part of the one before it."""
 _spells: Final[list[object]] = []
-"""The time from the first work of these to the last, if there are any."""
+"""A marker of the current spell of work, from its first piece to its last."""
 _silences: Final[list[object]] = []
-"""What shows a progress of its own."""
+"""The open blocks that show a progress bar of their own."""
 _changed: Final = Condition()
 
 
 @contextmanager
 def working(what: str, *, before_s: float = 0.0) -> Iterator[Work]:
-    """Say what the block does, as soon as it takes a second; also a decorator. See `Work`."""
+    """Say what the block does once it takes a second; also a decorator. See `Work`."""
     work = Work(what, before_s=before_s)
     try:
         with _changed:
@@ -75,7 +75,7 @@ def working(what: str, *, before_s: float = 0.0) -> Iterator[Work]:
 
 @contextmanager
 def silent() -> Iterator[None]:
-    """Say nothing in the block, which shows how far it is by itself."""
+    """Say nothing in the block, which shows its own progress."""
     silence = object()
     with _changed:
         _silences.append(silence)
@@ -87,16 +87,16 @@ def silent() -> Iterator[None]:
             _silences.remove(silence)
 
 
-def say_how_far(done: int, of: int | None, unit: str) -> None:
-    """Say how much is done of the innermost work of this thread, if there is any: "412 of 1,000 turns"."""
+def note_progress(done: int, of: int | None, unit: str) -> None:
+    """Note the progress of the innermost work of this thread, if there is any: "412 of 1,000 turns"."""
     for work in reversed(_works):
         if work.thread == get_ident():
             work.counted = done, of, unit
             return
 
 
-def now() -> str:
-    """Return what is under way, in a line; "" for nothing."""
+def progress_line() -> str:
+    """Return the work in progress as one line; "" for none."""
     if not _works:
         return ""
     last = _works[-1]
@@ -106,7 +106,7 @@ def now() -> str:
 
 
 def _say_now_and_then(spell: object) -> None:
-    """Say what is under way until nothing is."""
+    """Say what is in progress, again and again, until nothing is."""
     wait_s = FIRST_S
     with _changed:
         while not _changed.wait_for(lambda: spell not in _spells, wait_s):
@@ -114,7 +114,7 @@ def _say_now_and_then(spell: object) -> None:
             if _silences:
                 continue
             if LINE.is_over_written:
-                LINE.show(now())
+                LINE.show(progress_line())
             else:
-                ERR.write(f"{now()}\n")
+                ERR.write(f"{progress_line()}\n")
                 ERR.flush()

@@ -1,11 +1,11 @@
-"""Terminal output and figures of a run.
+"""The terminal's output about runs, and their figures.
 
 Modules, in the order in which one reads them:
     progress  a bar while a training runs
     course    the course of a run in sentences
-    summary   what a run came to
-    tables    tables of texts, for the terminal and for Markdown
+    summary   the results of a run: a verdict, a table and the files
+    text_tables  tables of texts and estimates, for the terminal, Markdown, LaTeX and CSV
     figures   the training curve
-    style     what all figures share: sizes, colours, legends
-    panels    what they draw into a panel: lines, dots with intervals, matrices
+    style     the style of all figures: sizes, colours, title, legend and caption
+    panels    the contents of panels: lines, dots with intervals, matrices
 """

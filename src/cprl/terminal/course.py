@@ -1,8 +1,8 @@
-"""The course of a run in sentences: what its agents get while they learn, what in fresh worlds, and why the
-two differ.
+"""Tells the course of a run in sentences, for the terminal, reports and notebooks.
 
-The terminal, reports and notebooks say it in these words. Verdicts rest on intervals over replicas; what a
-tragedy is says `cprl.measuring.outcome`.
+The sentences say how many apples the agents get while they learn and in fresh worlds, why the two differ, and
+whether they end better or worse off than random play. Verdicts rest on intervals over replicas. For the
+definition of a tragedy see `cprl.measuring.outcome`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,65 +14,69 @@ import pyarrow as pa
 
 from cprl.measuring.outcome import TRAGEDY, outcome_of
 from cprl.measuring.registry import COLLECTIVE_RETURN
-from cprl.measuring.statistics import Estimate, Family, differences, estimates, form_for
+from cprl.measuring.statistics import Estimate, Family, differences, estimates, number_format
 from cprl.measuring.table import by_replica, labelled, where, world_of
-from cprl.measuring.windows import LAST_EPISODES, last_of
+from cprl.measuring.windows import last_of
 from cprl.population import AgentSpec, any_learns, exploring
 from cprl.runs.episodes import read_episodes, read_rows
+from cprl.system.defaults import LAST_EPISODES
 
-FEW_REPLICAS: Final = 5
-"""So many are told one by one."""
-BETTER: Final = "better off"
-WORSE: Final = "worse off"
-LIFE: Final = "survival_steps"
-NEEDED: Final = (COLLECTIVE_RETURN, LIFE)
-"""The metrics of which a course is made."""
+_FEW_REPLICAS: Final = 5
+"""The largest number of replicas that are listed one by one."""
+_BETTER: Final = "better off"
+_WORSE: Final = "worse off"
+_LIFE: Final = "survival_steps"
+NEEDED: Final = (COLLECTIVE_RETURN, _LIFE)
+"""The metrics that a game must report for its runs to have a course."""
 _COLUMNS: Final = ("replica", "episode", "agent", *NEEDED, "steps", "terminated")
-LEARNING: Final = "while they learn"
-FRESH: Final = "in fresh worlds"
-RANDOM: Final = "random play"
+_LEARNING: Final = "while they learn"
+_FRESH: Final = "in fresh worlds"
+_RANDOM: Final = "random play"
 
 
 def course_of(run: Path, agents: Sequence[AgentSpec]) -> str:
-    """Return what became of a run, in sentences: a line for each fact, and last what they mean.
+    """Return the course of a run: one line for each fact, and a last line with their meaning.
 
     Args:
-        run: Its directory, with the evaluation.
-        agents: Who plays in it.
+        run: the directory of the run, with its evaluation.
+        agents: the specifications of its agents.
 
     Raises:
-        ValueError: If the game does not report harvests.
+        ValueError: if the game does not report harvests.
     """
     table = read_episodes(run)
-    if lacking := sorted(set(NEEDED) - set(table.column_names)):
-        raise ValueError(f"the episodes of {run} lack {', '.join(lacking)}; allowed: games that report them")
+    if missing := sorted(set(NEEDED) - set(table.column_names)):
+        raise ValueError(f"the episodes of {run} lack {', '.join(missing)}; allowed: games that report them")
     learns = any_learns(agents)
-    last = last_of(table, LAST_EPISODES)
+    last_learning = last_of(table, LAST_EPISODES)
     fresh = read_rows(run / "evaluation" / "trained.parquet")
     random = read_rows(run / "evaluation" / "random.parquet")
-    parts = {**({LEARNING: last} if learns else {}), FRESH: fresh, RANDOM: random}
-    played = pa.concat_tables(labelled(rows.select(_COLUMNS), when=when) for when, rows in parts.items())
+    phases = {_FRESH: fresh, _RANDOM: random}
+    if learns:
+        phases = {_LEARNING: last_learning, **phases}
+    played = pa.concat_tables(labelled(rows.select(_COLUMNS), when=phase) for phase, rows in phases.items())
     levels = estimates(played, NEEDED, "when")
-    gaps = differences(played, COLLECTIVE_RETURN, "when", {"when": RANDOM})
-    others = "agents who never learned" if learns else RANDOM
-    of_random = f"Random play gets {_got(levels, RANDOM)}."
+    gaps = differences(played, COLLECTIVE_RETURN, "when", {"when": _RANDOM})
+    baseline = "agents who never learned" if learns else _RANDOM
+    random_line = f"Random play gets {_got(levels, _RANDOM)}."
     if not learns:
-        lines = [f"In fresh worlds they get {_got(levels, FRESH)}.", *_replicas(fresh), of_random]
-        return "\n".join([*lines, _verdict(gaps, others)])
-    went = outcome_of(table, random=levels[RANDOM, COLLECTIVE_RETURN].value)
+        fresh_line = f"In fresh worlds they get {_got(levels, _FRESH)}."
+        lines = [fresh_line, *_replica_sentences(fresh), random_line]
+        return "\n".join([*lines, _verdict(gaps, baseline)])
+    outcome = outcome_of(table, random=levels[_RANDOM, COLLECTIVE_RETURN].value)
     lines = [
-        f"The agents began at {went.begins:.0f} apples an episode, all together, and reached "
-        f"{went.peak:.0f} around episode {went.around}.",
-        f"While they learn, in {last_text(table)}, they get {_got(levels, LEARNING)}.",
-        f"In fresh worlds, where {_differs(agents, table)}, they get {_got(levels, FRESH)}.",
-        *_replicas(fresh),
-        of_random,
+        f"The agents began at {outcome.begins:.0f} apples an episode, all together, and reached "
+        f"{outcome.peak:.0f} around episode {outcome.around}.",
+        f"While they learn, in {last_text(table)}, they get {_got(levels, _LEARNING)}.",
+        f"In fresh worlds, where {_fresh_conditions(agents, table)}, they get {_got(levels, _FRESH)}.",
+        *_replica_sentences(fresh),
+        random_line,
     ]
-    return "\n".join([*lines, _verdict(gaps, others, is_tragedy=went.word == TRAGEDY)])
+    return "\n".join([*lines, _verdict(gaps, baseline, is_tragedy=outcome.word == TRAGEDY)])
 
 
 def last_text(table: pa.Table, number: int = LAST_EPISODES) -> str:
-    """Return which episodes `last_of` takes, e.g. "the last 2 episodes of each of 16 worlds"."""
+    """Name the episodes that `last_of` takes, e.g. "the last 2 episodes of each of 16 worlds"."""
     taken = where(last_of(table, number), agent=0)
     replicas = len(taken["replica"].unique())
     worlds = len(np.unique(world_of(taken))) // replicas
@@ -81,85 +85,104 @@ def last_text(table: pa.Table, number: int = LAST_EPISODES) -> str:
     return last if worlds == 1 else f"{last} of each of {worlds} worlds"
 
 
-def _got(levels: Family, when: str) -> str:
-    return f"{levels[when, COLLECTIVE_RETURN]} apples, and boards last {levels[when, LIFE]} steps"
+def _got(levels: Family, phase: str) -> str:
+    """Return how many apples agents get and how long boards last, in words."""
+    return f"{levels[phase, COLLECTIVE_RETURN]} apples, and boards last {levels[phase, _LIFE]} steps"
 
 
-def _differs(agents: Sequence[AgentSpec], table: pa.Table) -> str:
-    """Return what is otherwise in fresh worlds than at the end of the training."""
+def _fresh_conditions(agents: Sequence[AgentSpec], table: pa.Table) -> str:
+    """Return in words how playing in fresh worlds differs from the end of the training."""
     replicas = len(table["replica"].unique())
     steps = int(where(table, agent=0)["steps"].to_numpy().sum()) // replicas
     settings = exploring(agents)
-    before = sorted({f"{one.epsilon(steps):.0%}" for one in settings})
-    after = sorted({f"{one.epsilon_evaluation:.0%}" for one in settings})
-    if before == after:
+    training_epsilons = sorted({f"{setting.epsilon(steps):.0%}" for setting in settings})
+    fresh_epsilons = sorted({f"{setting.epsilon_evaluation:.0%}" for setting in settings})
+    if training_epsilons == fresh_epsilons:
         return "nobody learns"
-    shares = f"{' or '.join(after)} of their steps, not {' or '.join(before)}"
+    shares = f"{' or '.join(fresh_epsilons)} of their steps, not {' or '.join(training_epsilons)}"
     return f"nobody learns and agents act at random in {shares}"
 
 
-def _replicas(fresh: pa.Table) -> list[str]:
-    """Return replicas one by one, where they are few; else in how many most boards die, where they differ."""
+def _replica_sentences(fresh: pa.Table) -> list[str]:
+    """Return a sentence about the differences between replicas, or no sentence if there are none to tell.
+
+    A few replicas are listed one by one. Of many, the sentence says in how many most boards die.
+    """
     apples = by_replica(fresh, COLLECTIVE_RETURN).sort_by("replica")["value"].to_pylist()
-    steps = by_replica(fresh, LIFE).sort_by("replica")["value"].to_pylist()
-    died = fresh.group_by("replica").aggregate([("terminated", "mean")])
-    shares = died.sort_by("replica")["terminated_mean"].to_pylist()
+    steps = by_replica(fresh, _LIFE).sort_by("replica")["value"].to_pylist()
+    deaths = fresh.group_by("replica").aggregate([("terminated", "mean")])
+    death_shares = deaths.sort_by("replica")["terminated_mean"].to_pylist()
     replicas = len(apples)
-    if 1 < replicas <= FEW_REPLICAS:
-        got = f"{_listed(apples, form_for(*apples))} apples and {_listed(steps, form_for(*steps))} steps"
-        return [f"By replica that is {got}; {_listed(shares, '.0%')} of the boards die."]
-    dead = sum(share > 0.5 for share in shares)
-    if not 0 < dead < replicas:
+    if 1 < replicas <= _FEW_REPLICAS:
+        harvests = f"{_listed(apples, number_format(*apples))} apples"
+        lives = f"{_listed(steps, number_format(*steps))} steps"
+        return [
+            f"By replica that is {harvests} and {lives}; {_listed(death_shares, '.0%')} of the boards die."
+        ]
+    dying = sum(share > 0.5 for share in death_shares)
+    if not 0 < dying < replicas:
         return []
-    return [f"There most boards of {dead} of the {replicas} replicas die, those of the others last."]
+    return [f"There most boards of {dying} of the {replicas} replicas die, those of the others last."]
 
 
-def _listed(values: Sequence[float], form: str) -> str:
-    *others, last = (f"{value:{form}}" for value in values)
-    return f"{', '.join(others)} and {last}"
+def _listed(values: Sequence[float], format_spec: str) -> str:
+    """Return numbers as "1, 2 and 3", each in the same format."""
+    *firsts, last = (f"{value:{format_spec}}" for value in values)
+    return f"{', '.join(firsts)} and {last}"
 
 
-def _verdict(gaps: Family, others: str, *, is_tragedy: bool = False) -> str:
-    """Return how agents end beside random play, as far as replicas can tell.
+def _verdict(gaps: Family, baseline: str, *, is_tragedy: bool = False) -> str:
+    """Return how the agents end in comparison with random play, as far as the replicas can tell.
 
     Args:
-        gaps: How much more they get than random play, by when.
-        others: Who plays at random.
-        is_tragedy: Whether what they get while they learn is a tragedy, if it can be told.
+        gaps: how much more they get than random play, while they learn and in fresh worlds.
+        baseline: the name of the agents that play at random.
+        is_tragedy: whether the harvest falls as in a tragedy while they learn.
     """
-    by_when = {when: one for (when, _), one in gaps.items()}
-    whether = f"Whether they end better or worse off than {others} cannot be told"
-    if all(one.replicas == 1 for one in by_when.values()):
-        return f"{whether}: one replica has no interval."
-    beside = " and ".join(f"{one:+} {when}" for when, one in by_when.items())
-    judged = {when: _judged(one) for when, one in by_when.items()}
-    meaning = _meaning(judged, others, whether, is_tragedy)
-    return f"Beside random play, in apples, that is {beside}.\n{meaning}"
+    gap_by_phase = {phase: gap for (phase, _), gap in gaps.items()}
+    undecided = f"Whether they end better or worse off than {baseline} cannot be told"
+    if all(gap.replicas == 1 for gap in gap_by_phase.values()):
+        return f"{undecided}: one replica has no interval."
+    comparison = " and ".join(f"{gap:+} {phase}" for phase, gap in gap_by_phase.items())
+    verdicts = {phase: _phase_verdict(gap) for phase, gap in gap_by_phase.items()}
+    meaning = _meaning(verdicts, baseline, undecided, is_tragedy)
+    return f"Beside random play, in apples, that is {comparison}.\n{meaning}"
 
 
-def _meaning(judged: Mapping[str, str], others: str, whether: str, is_tragedy: bool) -> str:
-    words = set(judged.values())
-    if is_tragedy and judged[LEARNING] == WORSE:
-        in_fresh = {WORSE: "", BETTER: " In fresh worlds they end better off.", "": f" {_unsure(FRESH)}"}
+def _meaning(verdict_by_phase: Mapping[str, str], baseline: str, undecided: str, is_tragedy: bool) -> str:
+    """Return the last line of a course.
+
+    Args:
+        verdict_by_phase: "better off", "worse off" or, if the replicas cannot tell, "", in each phase.
+        undecided: the sentence, without its full stop, for the case that no phase can tell.
+    """
+    verdicts = set(verdict_by_phase.values())
+    if is_tragedy and verdict_by_phase[_LEARNING] == _WORSE:
+        in_fresh = {_WORSE: "", _BETTER: " In fresh worlds they end better off.", "": f" {_unsure(_FRESH)}"}
         return (
             "Each agent learned to take what pays now, and while they learn all of them end worse off than "
-            f"{others}: the tragedy of the commons.{in_fresh[judged[FRESH]]}"
+            f"{baseline}: the tragedy of the commons.{in_fresh[verdict_by_phase[_FRESH]]}"
         )
-    if words == {""}:
-        return f"{whether}."
-    if len(words) == 1:
-        no_tragedy = ": no tragedy so far" if words == {BETTER} and len(judged) > 1 else ""
-        return f"They end {judged[FRESH]} than {others}{no_tragedy}."
-    known = [f"{when} they end {word} than {others}" for when, word in judged.items() if word]
-    unsure = [_unsure(when) for when, word in judged.items() if not word]
-    return " ".join([*(f"{one[0].upper()}{one[1:]}." for one in known), *unsure])
+    if verdicts == {""}:
+        return f"{undecided}."
+    if len(verdicts) == 1:
+        has_two_phases = len(verdict_by_phase) > 1
+        no_tragedy = ": no tragedy so far" if verdicts == {_BETTER} and has_two_phases else ""
+        return f"They end {verdict_by_phase[_FRESH]} than {baseline}{no_tragedy}."
+    sentences = []
+    for phase, verdict in verdict_by_phase.items():
+        if verdict:
+            sentences.append(f"{phase[0].upper()}{phase[1:]} they end {verdict} than {baseline}.")
+    sentences += [_unsure(phase) for phase, verdict in verdict_by_phase.items() if not verdict]
+    return " ".join(sentences)
 
 
-def _judged(gap: Estimate) -> str:
+def _phase_verdict(gap: Estimate) -> str:
+    """Return whether the interval of a difference is above or below 0; "" if it holds 0."""
     if gap.low > 0:
-        return BETTER
-    return WORSE if gap.high < 0 else ""
+        return _BETTER
+    return _WORSE if gap.high < 0 else ""
 
 
-def _unsure(when: str) -> str:
-    return f"Whether they do {when} cannot be told."
+def _unsure(phase: str) -> str:
+    return f"Whether they do {phase} cannot be told."

@@ -1,4 +1,4 @@
-"""What all figures share: size, letters and colours, where title, legend and caption stand, their files.
+"""The style of all figures: their size, fonts and colours, their title, legend and caption, and their files.
 
     with style.drawing("diagram.pdf", width="column") as sheet:
         left, right = sheet.panels(2, columns=sheet.fitting(2, 25), high=16)
@@ -19,28 +19,28 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 from matplotlib.patheffects import Normal, Stroke
 
 from cprl.pictures.colours import agent_colour
 from cprl.runs.files import refuse_to_write_over, write_atomically
-from cprl.terminal.tables import lines_of
+from cprl.terminal.text_tables import wrap_lines
 from cprl.values import checked, refusal
 
 Width = Literal["page", "column"]
-SUFFIXES: Final = (".png", ".pdf", ".svg")
+PICTURE_SUFFIXES: Final = (".png", ".pdf", ".svg")
 WIDTH_IN: Final[dict[Width, float]] = {"page": 8.0, "column": 3.3}
+"""The width of a figure in inches: of a whole page, or of a column of a paper."""
 TEXT_PT: Final[dict[Width, float]] = {"page": 9.0, "column": 6.5}
-"""The size of all text but titles; a page shows a figure of 1,200 pixels at about 800."""
+"""The size of all text but titles, in points. (Browsers show the 1,200 pixels of a page at about 800.)"""
 DPI: Final[dict[Width, int]] = {"page": 150, "column": 300}
-COLOURS: Final = 128
-"""Of a PNG of lines, which looks the same with all of them and is three times as large."""
-SHADES: Final = 256
-"""Of a PNG with a scale of colours."""
+PNG_COLOURS: Final = 128
+"""The number of colours in a PNG of lines. With all colours it looks the same and is three times larger."""
+PNG_SHADES: Final = 256
+"""The number of colours in a PNG that shows a colour scale."""
 CHARACTER: Final = 0.56
-"""The width of a character in em, about."""
+"""About the width of a character, in em."""
 _LOOK: Final[dict[str, Any]] = {
     **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon", "text.parse_math"), False),
     **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), "#6b6b6b"),
@@ -56,9 +56,12 @@ _LOOK: Final[dict[str, Any]] = {
     "svg.hashsalt": "cprl",
     "pdf.fonttype": 42,
 }
-"""Names are no formulas, though they may have dollar signs."""
+"""Settings of matplotlib. Formulas are off, because users' names may have dollar signs."""
+FIGURE_STYLE: Final = "cprl figures 2"
+"""The name of this style in the metadata of every figure. Raise its number when figures change their look."""
 
 MEAN: Final = "#08519c"
+"""The colour of means over replicas; the colours below are of single replicas, intervals and raw values."""
 REPLICA: Final = "#6baed6"
 INTERVAL: Final = "#4292c6"
 RAW: Final = "#b5b5b5"
@@ -82,29 +85,37 @@ MARK: Final = "#a50f15"
 EMPTY: Final = "#f2f2f2"
 """The colour of a cell without a number."""
 DASHES: Final[tuple[Any, ...]] = ("-", (0, (6, 2)), (0, (4, 1, 1, 1)), (0, (1, 1)))
+"""The line styles that distinguish agents of the same colour."""
 _AGENTS_OF_A_DASH: Final = 4
+"""The number of agents with the same line style, which have different colours."""
+_PAD_IN: Final = 3 / 72
+"""The default room of matplotlib's constrained layout above and below a part of a figure, in inches."""
 _EDGE: Final = "#303030"
 _FAINT: Final = "#555555"
 
 
 class Sheet:
-    """A figure that is being drawn. Whatever has a label in a panel is in the legend below all panels."""
+    """A figure while it is drawn. The legend below all panels shows whatever has a label in a panel."""
 
     def __init__(self, width: Width) -> None:
         self.width: Width = width
         self.width_em = 72 * WIDTH_IN[width] / TEXT_PT[width]
-        self._layout = ConstrainedLayoutEngine()
-        self.figure = Figure(layout=self._layout, dpi=DPI[width])
+        self.figure = Figure(layout="constrained", dpi=DPI[width])
         self.title = ""
-        """Some five words; how the figure was made is said in the caption."""
+        """The title, in about five words."""
         self.caption = ""
+        """The small text below the figure, which says how it was made."""
         self.legend_title = ""
-        self._high = self._wide = 0.0
-        self._row_high: dict[Axes, float] = {}
-        """The height of each panel's row in em."""
+        self._middle: Any = self.figure.subfigures()
+        """The panels and their legend, between title and caption."""
+        self._panel_wide_em = 0.0
+        self._row_heights_em: dict[Axes, float] = {}
+        """The height of each panel's row."""
+        self._panels_high_em = 0.0
+        """The height of all rows of panels together."""
 
     def fitting(self, number: int, least: float) -> int:
-        """Return how many of so many panels stand side by side, each at least so many em wide."""
+        """Return how many panels, of `number`, fit side by side if each is at least `least` em wide."""
         return max(1, min(number, int(self.width_em / least)))
 
     def panels(
@@ -116,94 +127,101 @@ class Sheet:
         beside: float = 0.0,
         **grid: Any,
     ) -> list[Axes]:
-        """Add panels in rows.
+        """Add panels in rows and return their axes.
 
         Args:
-            high: a row with its labels, in em; or each of them.
-            beside: em that names of rows take in each row of panels.
-            grid: of `Figure.subplots`, e.g. sharex.
+            number: the number of panels.
+            columns: the number of panels in a row.
+            high: the height of each row with its labels, or of all rows one by one, in em.
+            beside: the room that row names take to the left of the panels, in em.
+            grid: further arguments of `Figure.subplots`, e.g. sharex.
         """
         rows = -(-number // columns)
         heights = [float(high)] * rows if isinstance(high, int | float) else list(high)
-        self._high = sum(heights)
-        self._wide = (self.width_em - beside) / columns
+        self._panels_high_em = sum(heights)
+        self._panel_wide_em = (self.width_em - beside) / columns
         grid["gridspec_kw"] = {"height_ratios": heights}
-        panels = list(self.figure.subplots(rows, columns, squeeze=False, **grid).flat)
-        for place, axes in enumerate(panels):
-            self._row_high[axes] = heights[place // columns]
-            axes.set_visible(place < number)
+        panels = list(self._middle.subplots(rows, columns, squeeze=False, **grid).flat)
+        for index, axes in enumerate(panels):
+            self._row_heights_em[axes] = heights[index // columns]
+            axes.set_visible(index < number)
         return panels[:number]
 
     def finish(self) -> None:
-        """Put title, legend and caption around the panels, as high as they are."""
+        """Add title, legend and caption, and make the figure as high as all its parts need."""
         figure = self.figure
-        em_in = TEXT_PT[self.width] / 72
-        figure.set_size_inches(WIDTH_IN[self.width], 10)
-        for axes in figure.axes:
-            axes.set_title(wrapped(axes.get_title("left"), self._wide - 1))
-            axes.set_xlabel(wrapped(axes.get_xlabel(), self._wide - 2))
-            axes.set_ylabel(wrapped(axes.get_ylabel(), self._row_high.get(axes, self._high) - 3))
+        wide_in = WIDTH_IN[self.width]
+        any_height_in = 10  # the parts are measured first; the height is set below
+        figure.set_size_inches(wide_in, any_height_in)
+        self._wrap_labels()
         renderer: Any = FigureCanvasAgg(figure).get_renderer()  # type: ignore[no-untyped-call]
-        title = figure.text(
-            0, 1, wrapped(self.title, 0.86 * self.width_em), fontsize="large", va="top", ha="left"
-        )
-        drawn = wrapped(self.caption, self.width_em - 1, 0.47) if self.width == "page" else ""
-        caption = figure.text(0, 0, drawn, fontsize="small", color=_FAINT, va="bottom", ha="left")
-        legend = self._legend(renderer)
+        parts = self._add_legend(renderer)
+        left: Any = {"x": 0.5 / self.width_em, "ha": "left"}
+        if self.title:
+            title = wrapped(self.title, 0.86 * self.width_em)
+            parts.append(figure.suptitle(title, fontsize="large", **left))
+        if self.caption and self.width == "page":
+            caption = wrapped(self.caption, self.width_em - 1, 0.47)
+            parts.append(figure.supxlabel(caption, fontsize="small", color=_FAINT, **left))
+        high_in = self._panels_high_em * TEXT_PT[self.width] / 72
+        for part in parts:
+            high_in += part.get_window_extent(renderer).height / figure.dpi + 2 * _PAD_IN
+        figure.set_size_inches(wide_in, high_in)
+        self._scale_lines()
 
-        def high(part: Any) -> float:
-            return float(part.get_window_extent(renderer).height) / (em_in * figure.dpi)
+    def _wrap_labels(self) -> None:
+        """Wrap the titles and the axis labels of all panels."""
+        for axes in self.figure.axes:
+            row_height_em = self._row_heights_em.get(axes, self._panels_high_em)
+            axes.set_title(wrapped(axes.get_title("left"), self._panel_wide_em - 1))
+            axes.set_xlabel(wrapped(axes.get_xlabel(), self._panel_wide_em - 2))
+            axes.set_ylabel(wrapped(axes.get_ylabel(), row_height_em - 3))
 
-        over = high(title) + 0.8 if self.title else 0.0
-        under = high(caption) + 0.4 if drawn else 0.0
-        keys = high(legend) + 0.5 if legend else 0.0
-        total = over + self._high + keys + under + 0.6
-        figure.set_size_inches(WIDTH_IN[self.width], total * em_in)
-        left = 0.5 / self.width_em
-        title.set_position((left, 1 - 0.2 / total))
-        caption.set_position((left, 0.3 / total))
-        if legend:
-            legend.set_bbox_to_anchor((0, (under + 0.1) / total))
-        inner = (0, (under + keys) / total, 1, 1 - (under + keys + over) / total)
-        self._layout.set(rect=inner)
+    def _scale_lines(self) -> None:
+        """Make lines and markers thinner in a figure for a column, in proportion to its text."""
         scale = TEXT_PT[self.width] / TEXT_PT["page"]
-        for line in figure.findobj(Line2D) if scale != 1 else ():
+        if scale == 1:
+            return
+        for line in self.figure.findobj(Line2D):
             assert isinstance(line, Line2D)
             line.set(linewidth=scale * line.get_linewidth(), markersize=scale * line.get_markersize())
 
-    def _legend(self, renderer: Any) -> Any:
-        """Return a legend of everything that has a label, each label once, in as many columns as fit."""
+    def _add_legend(self, renderer: Any) -> list[Any]:
+        """Add a legend in as many columns as fit, with each label once.
+
+        Return a list of the legend, which is empty if nothing has a label.
+        """
         entries: dict[str, Any] = {}
         for axes in self.figure.axes:
             for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
                 entries.setdefault(wrapped(label, self.width_em - 4), handle)
-        legend = None
         for columns in range(len(entries), 0, -1):
-            legend = self.figure.legend(
+            legend = self._middle.legend(
                 list(entries.values()),
                 list(entries),
-                loc="lower left",
+                loc="outside lower left",
                 ncols=columns,
                 title=wrapped(self.legend_title, self.width_em - 4) or None,
                 alignment="left",
             )
             if columns == 1 or legend.get_window_extent(renderer).width <= self.figure.bbox.width:
-                break
+                return [legend]
             legend.remove()
-        return legend
+        return []
 
 
 @contextmanager
 def drawing(
-    path: Path | str, *, width: Width = "page", colours: int = COLOURS, is_new: bool = False
+    path: Path | str, *, width: Width = "page", colours: int = PNG_COLOURS, is_new: bool = False
 ) -> Iterator[Sheet]:
-    """Draw a figure in a block of code, and write it at its end: a PNG, PDF or SVG by the name of the path.
+    """Draw a figure within the block, and write it at the end of the block.
 
     Args:
-        width: "page", or "column" of a paper, 3.3 inches wide; then the caption stands in a file beside it,
-            `NAME.caption.txt`.
-        colours: of a PNG.
-        is_new: whether a picture that is there is refused.
+        path: the file; its suffix decides whether it is a PNG, a PDF or an SVG.
+        width: "page", or "column" for a column of a paper, 3.3 inches wide. The caption of a column is
+            written to a text file beside the figure, `NAME.caption.txt`.
+        colours: the number of colours in a PNG.
+        is_new: whether to refuse a path that exists.
     """
     path = check_picture(path, is_new=is_new)
     checked("width", width, Width)
@@ -220,54 +238,68 @@ def drawing(
 
 
 def check_picture(path: str | Path, name: str = "path", *, is_new: bool = True) -> Path:
-    """Return the path of a picture to be, checked before hours of work; its folder may be missing."""
+    """Check the path of a figure before hours of work, and return it; its folder need not exist.
+
+    Args:
+        name: the name of the argument, for a refusal.
+        is_new: whether to refuse a path that exists.
+    """
     path = Path(path)
-    if path.suffix not in SUFFIXES:
-        raise refusal(name, str(path), f"a file whose name ends in {', '.join(SUFFIXES)}")
+    if path.suffix not in PICTURE_SUFFIXES:
+        raise refusal(name, str(path), f"a file whose name ends in {', '.join(PICTURE_SUFFIXES)}")
     if is_new:
         refuse_to_write_over(path)
     return path
 
 
-def save(figure: Figure, path: Path, *, colours: int = COLOURS, title: str = "", caption: str = "") -> Path:
-    """Write a picture atomically, a PNG of so few colours."""
+def save(
+    figure: Figure, path: Path, *, colours: int = PNG_COLOURS, title: str = "", caption: str = ""
+) -> Path:
+    """Write a figure completely or not at all.
+
+    Args:
+        colours: the number of colours in a PNG.
+        title: the title in the file's metadata.
+        caption: the description in the file's metadata.
+    """
     drawn = BytesIO()
-    about: dict[str, str | None] = {"Title": title, "Description": caption}
+    metadata: dict[str, str | None] = {"Title": title, "Description": caption, "Software": FIGURE_STYLE}
     if path.suffix == ".pdf":
-        about = {"Title": title, "Subject": caption, "CreationDate": None}
+        metadata = {"Title": title, "Subject": caption, "Creator": FIGURE_STYLE, "CreationDate": None}
     elif path.suffix == ".svg":
-        about["Date"] = None
-    figure.savefig(drawn, format=path.suffix[1:], metadata=about)
+        metadata = {"Title": title, "Description": caption, "Creator": FIGURE_STYLE, "Date": None}
+    figure.savefig(drawn, format=path.suffix[1:], metadata=metadata)
     drawn = _with_colours(drawn, colours) if path.suffix == ".png" else drawn
     return write_atomically(path, lambda file: file.write(drawn.getvalue()))
 
 
 def _with_colours(drawn: BytesIO, colours: int) -> BytesIO:
-    """Return a PNG with so few colours, each near those that it stands for."""
+    """Return a PNG with fewer colours, each near those that it replaces."""
     from PIL import Image
     from PIL.PngImagePlugin import PngInfo
 
-    few = BytesIO()
+    reduced = BytesIO()
     texts = PngInfo()
     with Image.open(drawn) as picture:
-        for name in ("Title", "Description"):
+        for name in ("Title", "Description", "Software"):
             texts.add_itxt(name, picture.info[name])
-        chosen = picture.convert("RGB").quantize(
+        quantized = picture.convert("RGB").quantize(
             colours, method=Image.Quantize.MAXCOVERAGE, kmeans=2, dither=Image.Dither.NONE
         )
-        chosen.save(few, format="png", optimize=True, dpi=picture.info["dpi"], pnginfo=texts)
-    return few
+        quantized.save(reduced, format="png", optimize=True, dpi=picture.info["dpi"], pnginfo=texts)
+    return reduced
 
 
 def wrapped(text: str, wide: float, character: float = CHARACTER) -> str:
-    """Return a text in lines of so many em."""
-    return lines_of(text, max(4, int(wide / character)))
+    """Break a text into lines of at most `wide` em, with characters of about `character` em."""
+    return wrap_lines(text, max(4, int(wide / character)))
 
 
 def on_white(agent: int) -> dict[str, Any]:
-    """Return an agent's colour for a line on white, with a dark edge, as some agents are as light as yellow.
+    """Return the style of an agent's line on a white background: its colour with a dark edge.
 
-    Agents 4 and on have dashes too, because their colours repeat.
+    The edge makes light colours such as yellow visible. Agents 4 and on also have dashes, because their
+    colours repeat.
     """
     red, green, blue = agent_colour(agent)
     edge = [Stroke(linewidth=3.2, foreground=_EDGE), Normal()]
@@ -276,8 +308,7 @@ def on_white(agent: int) -> dict[str, Any]:
 
 
 def draw_cell(axes: Axes, x: int, y: int, colour: Any, text: str) -> None:
-    """Draw the cell about (x, y), one unit wide and high, its text black on light cells and white on dark
-    ones."""
+    """Draw a cell of one unit around (x, y); its text is black on light colours and white on dark ones."""
     red, green, blue, _ = to_rgba(colour)
     ink = "black" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.5 else "white"
     axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))

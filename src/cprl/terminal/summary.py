@@ -1,4 +1,4 @@
-"""The results of a run, printed in the terminal: first what they come to, then a table and files."""
+"""Prints the results of a run: a verdict, a table that compares policies, and the files of the run."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,25 +10,25 @@ from rich.console import Console
 from rich.text import Text
 
 from cprl.measuring.registry import (
+    AGENT_TOTALS,
     APPLES,
     COLLECTIVE_RETURN,
     INCOME,
     INCOME_EQUALITY,
     METRICS,
-    OF_AGENTS,
     with_unit,
 )
-from cprl.measuring.statistics import HOLM, Estimate, Family, differences, estimates, notes_on
-from cprl.measuring.table import agents_named, numbers_in, where
+from cprl.measuring.statistics import HOLM_NOTE, Family, differences, estimates, notes_on
+from cprl.measuring.table import all_metrics, display_name, where
 from cprl.runs.episodes import LEFT_OUT
-from cprl.system.output import console as safe_console
-from cprl.system.output import printed
-from cprl.system.shipped import cprl_here
-from cprl.terminal.tables import Cell, Cells, Change
+from cprl.system.output import console as safe_console, quote_command
+from cprl.system.shipped import cprl_command
+from cprl.terminal.text_tables import Change, TableCell, TextTable
 
 _FILES: Final = ("recipe.json", "episodes.parquet", "run.rrd", "checkpoints", "figures")
+"""The files and folders of a run that are listed."""
 OVER_REPLICAS: Final = "mean over replicas [95 % interval by Student's t]"
-"""What a number on a page is."""
+"""The words that explain the numbers of a table."""
 ZEROS: Final = "Numbers of institutions that are 0 or undefined everywhere are left out."
 IDLE: Final = "{}: nobody harvested anything, so equality and sustainability are undefined"
 
@@ -43,116 +43,140 @@ def summarise(
     note: str | None = None,
     console: Console | None = None,
 ) -> None:
-    """Print what became of the run, a table that compares policies, and the files of the run.
+    """Print a verdict on the run, a table that compares policies, and the files of the run.
 
     Args:
-        played: Episodes in fresh worlds, labelled by "policy"; the first policy is what others are compared
-            with.
-        course: See `cprl.terminal.course`; by default what each policy gets.
+        run: the run's directory.
+        title: the heading of the table.
+        played: episodes in fresh worlds with the label "policy". All policies are compared with the first.
+        course: the verdict, see `cprl.terminal.course.course_of`; by default it says how much each policy
+            gets.
+        figure: the training curve, if it was drawn.
+        note: a line below the table.
+        console: where to print; by default the terminal.
     """
     console = console or safe_console()
     baseline = played["policy"][0].as_py()
-    numbers = list(filter(_is_summarised, every_number(played)))
+    metrics = list(filter(_is_summarised, ordered_metrics(played)))
     console.print(Text(course or _verdict(played, baseline), style="bold"))
-    console.print(compared(played, f"{title}\n{OVER_REPLICAS}", numbers=numbers, reference=baseline))
+    console.print(comparison_table(played, f"{title}\n{OVER_REPLICAS}", metrics=metrics, reference=baseline))
     files = [name for name in _FILES if (run / name).exists()]
     lines = [note, f"Saved in {run}: {', '.join(files)}", f"Training curve: {figure}" if figure else None]
     if any(run.glob("run*.rrd")):
-        lines.append(f"Watch again: {printed([*cprl_here(), 'watch', str(run)])}")
+        lines.append(f"Watch again: {quote_command([*cprl_command(), 'watch', str(run)])}")
     for line in filter(None, lines):
         console.print(line, soft_wrap=True, highlight=False, markup=False)
 
 
-def every_number(table: pa.Table) -> list[str]:
-    """Return the names of all numbers in the order of pages: of whole episodes, then of each agent."""
-    numbers = [name for name in numbers_in(table) if name != INCOME]
-    numbers.insert(numbers.count(COLLECTIVE_RETURN), INCOME)
-    amounts = [name for name in ("return", *OF_AGENTS) if name in table.column_names]
+def ordered_metrics(table: pa.Table) -> list[str]:
+    """Return the names of all metrics in the order of their rows: of whole episodes, then of each agent.
+
+    The income follows the collective return. A metric of an agent has a name such as "agent_0/return".
+    """
+    metrics = [metric for metric in all_metrics(table) if metric != INCOME]
+    income_index = 1 if COLLECTIVE_RETURN in metrics else 0
+    metrics.insert(income_index, INCOME)
+    amounts = [amount for amount in ("return", *AGENT_TOTALS) if amount in table.column_names]
     agents = range(len(table["agent"].unique()))
-    return [*numbers, *(f"agent_{agent}/{name}" for name in amounts for agent in agents)]
+    return [*metrics, *(f"agent_{agent}/{amount}" for amount in amounts for agent in agents)]
 
 
 def _is_summarised(name: str) -> bool:
+    """Return whether a metric is in the table that follows a run."""
     metric = METRICS.get(name)
     if metric is None:
         return not name.endswith("/return")
-    is_gain = name in (COLLECTIVE_RETURN, INCOME)
-    return is_gain or metric.is_summarised or metric.is_of_institutions
+    is_total_gain = name in (COLLECTIVE_RETURN, INCOME)
+    return is_total_gain or metric.is_summarised or metric.is_of_institutions
 
 
 def rewards_of(table: pa.Table) -> str:
-    """Return the unit of rewards: apples in a game that reports harvests; in another they have none."""
+    """Return the unit of rewards: "apples" if the game reports harvests, else "" for none."""
     return APPLES if "harvest" in table.column_names else ""
 
 
-def says_nothing(name: str, family: Family) -> bool:
-    """Return whether a number is of institutions, and undefined or 0 in a whole family."""
+def is_empty_row(name: str, family: Family) -> bool:
+    """Return whether a metric is about institutions, and is undefined or 0 in all estimates of a family."""
     metric = METRICS.get(name)
-    is_amount = name.rpartition("/")[2] in OF_AGENTS
+    is_amount = name.rpartition("/")[2] in AGENT_TOTALS
     is_of_institutions = is_amount if metric is None else metric.is_of_institutions
-    estimates_of = (one for key, one in family.items() if key[-1] == name)
-    return is_of_institutions and not any(one.replicas and one.value for one in estimates_of)
+    metric_estimates = (estimate for key, estimate in family.items() if key[-1] == name)
+    has_value = any(estimate.replicas and estimate.value for estimate in metric_estimates)
+    return is_of_institutions and not has_value
 
 
-def compared(
+def comparison_table(
     table: pa.Table,
     heading: str,
     *,
-    numbers: Sequence[str] = (),
+    metrics: Sequence[str] = (),
     reference: str = "random",
     names: Mapping[str, str] | None = None,
-) -> Cells:
-    """Return a row for each number: a column for each policy, then one for what each has more than the
-    reference, paired by replica.
+) -> TextTable:
+    """Return a table that compares policies, with a row for each metric.
 
-    Numbers that `says_nothing` have no row, and incomes none where they are the harvests.
+    Each policy has a column with its means, and each policy but the reference a column with its differences
+    to the reference, paired by replica. Metrics of institutions without any value have no row, and neither do
+    incomes that equal the harvests.
 
     Args:
-        table: Of episodes, labelled by "policy", see `cprl.measuring.table`.
-        numbers: Their names; by default `every_number`.
-        names: What policies are called instead of their label.
+        table: episodes with the label "policy", see `cprl.measuring.table`.
+        metrics: the names of the metrics; by default `ordered_metrics`.
+        reference: the policy with which all others are compared.
+        names: the names of policies in the head of the table; by default their labels.
     """
-    numbers = numbers or every_number(table)
-    levels = estimates(table, numbers, "policy")
-    changes = differences(table, numbers, "policy", {"policy": reference})
+    metrics = metrics or ordered_metrics(table)
+    levels = estimates(table, metrics, "policy")
+    changes = differences(table, metrics, "policy", {"policy": reference})
     policies = [policy for (policy,) in levels.labels]
-    others = [policy for policy in policies if policy != reference]
-    called = {policy: (names or {}).get(policy, policy) for policy in policies}
-    silent = {name for name in numbers if says_nothing(name, levels)}
-    repeated = {name for name in (INCOME, INCOME_EQUALITY) if _is_repeated(name, levels)}
-    rows: list[list[Cell]] = []
-    for name in levels.numbers:
-        if name not in silent | repeated:
-            values = [levels[policy, name] for policy in policies]
-            gaps = [_change(changes.get((policy, name))) for policy in others]
-            words = with_unit(agents_named(table, name), rewards=rewards_of(table))
-            rows.append([words, *values, *gaps])
-    of_policies = [where(table, policy=policy) for policy in policies]
-    blank = [""] * len(others)
-    rows.append(["episodes", *(str(len(where(one, agent=0))) for one in of_policies), *blank])
-    if "harvest" in table.column_names:
-        harvests = [one["harvest"].to_pylist() for one in of_policies]
-        idle = [f"{each.count(0)} of {len(each)}" for each in harvests]
-        if any(0 in each for each in harvests):
-            rows.append(["agents without a harvest, not in sustainability", *idle, *blank])
+    compared = [policy for policy in policies if policy != reference]
+    policy_names = {policy: (names or {}).get(policy, policy) for policy in policies}
+    empty = {metric for metric in metrics if is_empty_row(metric, levels)}
+    repeated = {metric for metric in (INCOME, INCOME_EQUALITY) if _is_repeated(metric, levels)}
+    rows: list[list[TableCell]] = []
+    for metric in levels.numbers:
+        if metric not in empty | repeated:
+            title = with_unit(display_name(table, metric), rewards=rewards_of(table))
+            row: list[TableCell] = [title, *(levels[policy, metric] for policy in policies)]
+            for policy in compared:
+                change = changes.get((policy, metric))
+                row.append("" if change is None else Change(change))
+            rows.append(row)
+    for title, counts in _counts(table, policies).items():
+        rows.append([title, *counts, *[""] * len(compared)])
     notes = [
         (table.schema.metadata or {}).get(LEFT_OUT, b"").decode(),
-        ZEROS if silent else "",
-        *(IDLE.format(called[policy]) for policy in policies if _is_idle(levels, policy)),
+        ZEROS if empty else "",
+        *(IDLE.format(policy_names[policy]) for policy in policies if _is_idle(levels, policy)),
         *notes_on(levels.values()),
-        f"{HOLM} for {changes.name}." if any(one.differs for one in changes.values()) else "",
+        f"{HOLM_NOTE} for {changes.name}." if any(change.differs for change in changes.values()) else "",
     ]
-    head = ["", *called.values(), *(f"{called[policy]} - {called[reference]}, paired" for policy in others)]
-    return Cells(heading, head, rows, "\n".join(filter(None, notes)))
+    reference_name = policy_names[reference]
+    head = ["", *policy_names.values()]
+    head += [f"{policy_names[policy]} - {reference_name}, paired" for policy in compared]
+    return TextTable(heading, head, rows, "\n".join(filter(None, notes)))
+
+
+def _counts(table: pa.Table, policies: Sequence[str]) -> dict[str, list[str]]:
+    """Return rows of counts by title: the episodes of each policy, and its agents without a harvest."""
+    tables = [where(table, policy=policy) for policy in policies]
+    counts = {"episodes": [str(len(where(rows, agent=0))) for rows in tables]}
+    if "harvest" in table.column_names:
+        harvests = [rows["harvest"].to_pylist() for rows in tables]
+        if any(0 in harvest for harvest in harvests):
+            idle = [f"{harvest.count(0)} of {len(harvest)}" for harvest in harvests]
+            counts["agents without a harvest, not in sustainability"] = idle
+    return counts
 
 
 def _is_repeated(name: str, levels: Family) -> bool:
-    """Return whether a number is that which it is where nobody pays anything."""
-    same = METRICS[name].same_as
-    if not {name, same} <= set(levels.numbers):
+    """Return whether a metric repeats another one: incomes equal harvests if institutions pay nothing."""
+    original = METRICS[name].same_as
+    if not {name, original} <= set(levels.numbers):
         return False
-    values, others = ([levels[*labels, one].value for labels in levels.labels] for one in (name, same))
-    return np.allclose(values, others, rtol=1e-6, atol=1e-6, equal_nan=True)
+    values = [levels[*labels, name].value for labels in levels.labels]
+    original_values = [levels[*labels, original].value for labels in levels.labels]
+    return np.allclose(values, original_values, rtol=1e-6, atol=1e-6, equal_nan=True)
 
 
 def _is_idle(levels: Family, policy: str) -> bool:
@@ -160,12 +184,8 @@ def _is_idle(levels: Family, policy: str) -> bool:
     return harvest is not None and harvest.value == 0
 
 
-def _change(difference: Estimate | None) -> Cell:
-    return "" if difference is None else Change(difference)
-
-
 def _verdict(played: pa.Table, baseline: str) -> str:
-    """Return what each policy gets, and how much more than the baseline over replicas."""
+    """Return in words how much each policy gets, and how much more than the baseline."""
     has_harvest = COLLECTIVE_RETURN in played.column_names
     name = COLLECTIVE_RETURN if has_harvest else INCOME
     levels = estimates(played, name, "policy")
@@ -173,11 +193,11 @@ def _verdict(played: pa.Table, baseline: str) -> str:
     parts = []
     for (policy, _), level in levels.items():
         gap = gaps.get((policy, name))
-        beside = "" if gap is None else f" ({gap:+} beside {_called(baseline)})"
-        parts.append(f"{_called(policy)}: {level}{beside}")
+        comparison = "" if gap is None else f" ({gap:+} beside {_policy_name(baseline)})"
+        parts.append(f"{_policy_name(policy)}: {level}{comparison}")
     unit = APPLES if has_harvest else "of return"
     return f"{'; '.join([parts[-1], *parts[:-1]])} {unit} an episode, all agents together"
 
 
-def _called(policy: str) -> str:
+def _policy_name(policy: str) -> str:
     return "random play" if policy == "random" else policy

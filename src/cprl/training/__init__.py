@@ -1,12 +1,12 @@
 """Training: the loop, the agents of a population, and a run from its experiment to its report.
 
 Modules, in the order in which one reads them:
-    learning    losses and wanted returns of the running episodes; whom a training accepts
-    finite      what is NaN or infinite in a training, found and named
+    learning    losses and shaped returns of the running episodes; whom a training accepts
+    nan_check   what is NaN or infinite in a training, found and named
     training    Training: one step after the other, with a state that can be read and set; train; callbacks
     stored      load: agents that an earlier run learned, and how they play
     agents      Population: the agents of an experiment, of whatever kind
-    outcome     what is made of an experiment, and the trained agents in fresh worlds
+    evaluating  what is made of an experiment, and the trained agents in fresh worlds
     running     run: an experiment from its learners to its report
 """
 

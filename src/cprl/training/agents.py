@@ -1,4 +1,4 @@
-"""Population: the agents of an experiment, of whatever kind."""
+"""Population: the agents of an experiment that learn, follow a script, or were trained by an earlier run."""
 
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -14,20 +14,14 @@ from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import spaces_of
 from cprl.envs.unwrap import commons_of
-from cprl.learners.base import AnyLearner
 from cprl.learners.lanes import Lanes
-from cprl.networks.agent import acting_part
+from cprl.learners.protocol import AnyLearner
+from cprl.networks.agent import acting_network
 from cprl.networks.recurrent import state_shape_of
 from cprl.objectives.rewards import reward_name
-from cprl.policies.assignment import AgentIndices, AgentPolicies
-from cprl.policies.decisions import (
-    Bandit,
-    BanditDecider,
-    ballot_sizes,
-    stored_decisions,
-)
-from cprl.policies.lanes import random_agents
-from cprl.policies.present import PresentPolicy
+from cprl.policies.actors import random_agents
+from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
+from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
 from cprl.population import (
     AgentSpec,
@@ -41,11 +35,11 @@ from cprl.population import (
     specs_by_agent,
 )
 from cprl.training.stored import LoadedRun, StoredAgent, decision_values, load, stored_actors, trained_agent
-from cprl.values import Custom, made, shown
+from cprl.values import Custom, instantiate, short_repr
 
 
-def _refuse_unmarked(spec: Learning | Team, env: EnvBase) -> None:
-    """Raises a ValueError for learning from turns in play alone in a game that does not say who is."""
+def _refuse_only_in_play(spec: Learning | Team, env: EnvBase) -> None:
+    """Raise a ValueError for `only_in_play` in a game without the entry "in_play"."""
     settings = getattr(_algorithm_of(spec), "settings", None)
     if getattr(settings, "only_in_play", False) and keys.IN_PLAY not in env.observation_spec.keys(True, True):
         raise ValueError(
@@ -57,16 +51,16 @@ class Population:
     """The agents of R replicas of an environment, specified in any mix.
 
     Args:
-        env: a world for each replica, with its transforms: agents are made for what it shows them.
+        env: the worlds, with their transforms; agents are made for its observations.
         specs: the specification of each agent, see `cprl.population`.
-        seed: of the run; each agent of each replica has random numbers of its own.
+        seed: the seed of the run; each agent of each replica has its own random numbers.
         worlds: the worlds W of each replica; world b of `env` belongs to replica b // W.
         first_replica: the number of the first replica, so that replica r can be trained alone.
         engine: "compiled", "eager" or "torchrl", see `Experiment.engine`.
-        starts: whether agents that start from stored weights get them; False where a checkpoint follows,
-            which has later ones.
-        weights: the names of the weights that `Frozen` agents play with, see `cprl.load`, by their run; of
-            runs that are not in it the final ones.
+        starts: whether agents with `start_from` get the stored weights; False if a checkpoint with later
+            weights is loaded next.
+        weights: the names of the weights of `Frozen` agents by run, see `cprl.load`; runs not in it have
+            their final ones.
     """
 
     def __init__(
@@ -84,191 +78,194 @@ class Population:
         known = get_args(TrainingEngine)
         if engine not in known:
             more = '; "auto" is for an Experiment, which says how long it trains' * (engine == "auto")
-            raise ValueError(f"engine is {shown(engine)}; allowed: {', '.join(map(shown, known))}{more}")
-        self.spaces, self.specs, self.seed = spaces_of(env), tuple(specs), seed
-        self.replicas, self.worlds = env.batch_size.numel() // worlds, worlds
+            raise ValueError(
+                f"engine is {short_repr(engine)}; allowed: {', '.join(map(short_repr, known))}{more}"
+            )
+        self.spaces = spaces_of(env)
+        self.specs = tuple(specs)
+        self.seed = seed
+        self.worlds = worlds
+        self.replicas = env.batch_size.numel() // worlds
         commons = commons_of(env)
         self._game = None if commons is None else commons.game
-        self._device = env.device or torch.device("cpu")
+        self.device = env.device or torch.device("cpu")
         groups = grouped(specs, self.spaces.agents)
-        self._by_agent = specs_by_agent(specs, self.spaces.agents)
+        self._specs_by_agent = specs_by_agent(specs, self.spaces.agents)
         check_scripted(groups, self.spaces, self._game)
-        self._numbers = range(first_replica, first_replica + self.replicas)
-        self._stored = self._agents_that_do_not_learn(weights or {})
+        self._replica_numbers = range(first_replica, first_replica + self.replicas)
+        self._stored_agents = self._load_stored_agents(weights or {})
         self.learners: dict[tuple[int, ...], AnyLearner] = {}
         for spec, agents in groups:
             if isinstance(spec, Learning | Team):
-                _refuse_unmarked(spec, env)
-                self.learners[agents] = self._learner(spec, agents, engine, starts)
-        self.others: dict[AgentIndices, nn.Module] = self._others(Purpose.EXPLORATION, worlds=worlds)
-        self.decisions: BanditDecider | None = self._decisions()
-        """What the agents decide, and learn to, where the game asks them."""
+                _refuse_only_in_play(spec, env)
+                self.learners[agents] = self._make_learner(spec, agents, engine, starts)
+        self.others: dict[ActorAgents, nn.Module] = self.other_actors(Purpose.EXPLORATION, worlds=worlds)
+        self.decisions: BanditDecider | None = self._make_decider()
+        """The decisions of the agents on the game's ballots, and how they learn them; None without
+        ballots."""
 
     @property
     def playing(self) -> Game | Spaces:
-        """What policies are made for, see `LoadedRun.playing`."""
+        """Return the game or spaces that policies are made for, see `LoadedRun.playing`."""
         return self._game or self.spaces
 
-    def policy(self, worlds: int) -> AgentPolicies:
-        """All agents as they are now, in so many worlds of each replica side by side; those that learn values
-        explore with `epsilon_evaluation`."""
-        learned: dict[AgentIndices, nn.Module] = {
+    def policy(self, worlds: int) -> JointPolicy:
+        """Return the current policies of all agents, for several worlds of each replica; agents that learn
+        values explore with `epsilon_evaluation`."""
+        actors: dict[ActorAgents, nn.Module] = {
             agents: learner.evaluation_actor(worlds) for agents, learner in self.learners.items()
         }
-        decisions = None if self.decisions is None else self.decisions.evaluation(worlds)
-        return AgentPolicies(
-            {**learned, **self._others(Purpose.EVALUATION, worlds=worlds)}, decisions=decisions
-        )
-
-    def present_policy(self) -> PresentPolicy:
-        """All agents of the first replica as they are now, whenever it is called, in one world."""
-        with torch.random.fork_rng(devices=[]):
-            actors: dict[AgentIndices, Any] = {
-                agents: (learner.evaluation_actor(1), learner.actor)
-                for agents, learner in self.learners.items()
-            }
-            decisions = self.decisions
-            return PresentPolicy(
-                actors,
-                self._others(Purpose.EXHIBITION, worlds=1, replicas=1),
-                decisions=None if decisions is None else (decisions.first_replica(), decisions),
-                replicas=self.replicas,
-                device=self._device,
+        actors |= self.other_actors(Purpose.EVALUATION, worlds=worlds)
+        decisions = None
+        if self.decisions is not None:
+            decisions = self.decisions.without_exploration(
+                Purpose.EVALUATED_DECISIONS, replicas=self.replicas, worlds=worlds
             )
+        return JointPolicy(actors, decisions=decisions)
 
-    def random_policy(self, worlds: int) -> AgentPolicies:
-        """Every agent takes every action with equal probability, and every choice where it decides."""
+    def random_policy(self, worlds: int) -> JointPolicy:
+        """Return policies that take every action, and every choice of a decision, with equal probability."""
         everyone = tuple(range(self.spaces.agents))
         actors = random_agents(self.spaces, everyone, replicas=self.replicas, seed=self.seed, worlds=worlds)
-        decisions = None
-        if self._game is not None:
-            replicas = range(self.replicas)
-            purpose = Purpose.RANDOM_PLAY
-            decisions = stored_decisions(
-                self._game, {}, replicas=replicas, worlds=worlds, seed=self.seed, purpose=purpose
-            )
-        return AgentPolicies(actors, decisions=decisions)
+        if self._game is None:
+            return JointPolicy(actors)
+        decisions = stored_decisions(
+            self._game,
+            {},
+            replicas=range(self.replicas),
+            worlds=worlds,
+            seed=self.seed,
+            purpose=Purpose.RANDOM_PLAY,
+        )
+        return JointPolicy(actors, decisions=decisions)
 
     def networks(self) -> dict[str, nn.Module]:
-        """A copy of each learner's acting network as it is now, by "replica_0/agent_0" and so on."""
-        return {
-            name: network
-            for learner in self.learners.values()
-            for name, network in learner.networks().items()
-        }
+        """Return copies of the learners' current acting networks, by "replica_0/agent_0" and so on."""
+        networks: dict[str, nn.Module] = {}
+        for learner in self.learners.values():
+            networks |= learner.networks()
+        return networks
 
     def as_stored(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
-        """Copies of the agents as they are now, by agent and replica, of these replicas."""
+        """Return copies of the current agents of some replicas, by agent and replica."""
         networks = self.networks()
         decisions = {} if self.decisions is None else self.decisions.learned()
         agents: list[list[StoredAgent]] = []
-        for agent, spec in enumerate(self._by_agent):
+        for agent, spec in enumerate(self._specs_by_agent):
             if isinstance(spec, Learning | Team):
                 lanes = [lane_name(replica, agent) for replica in replicas]
                 agents.append([trained_agent(spec, networks[lane], decisions.get(lane)) for lane in lanes])
             else:
-                agents.append([self._stored[agent][self._numbers.index(replica)] for replica in replicas])
+                agents.append(
+                    [self._stored_agents[agent][self._replica_numbers.index(replica)] for replica in replicas]
+                )
         return agents
 
-    def _agents_that_do_not_learn(self, weights: Mapping[str, str]) -> dict[int, list[StoredAgent]]:
-        """The agents of each replica, by their index; each stored run is read once."""
+    def _load_stored_agents(self, weights: Mapping[str, str]) -> dict[int, list[StoredAgent]]:
+        """Return the scripted and frozen agents of each replica by index; each stored run is read once."""
         runs: dict[str, LoadedRun] = {}
         agents: dict[int, list[StoredAgent]] = {}
-        for agent, spec in enumerate(self._by_agent):
+        for agent, spec in enumerate(self._specs_by_agent):
             if isinstance(spec, Scripted):
                 agents[agent] = [StoredAgent(scripted=spec.policy)] * self.replicas
             elif isinstance(spec, Frozen):
                 if spec.run not in runs:
                     runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
-                    _refuse_unfitting(runs[spec.run], self.spaces, self._game, is_to_decide=True)
-                replicas = map(spec.replica_for, self._numbers)
+                    _refuse_other_game(runs[spec.run], self.spaces, self._game, is_to_decide=True)
+                replicas = map(spec.replica_for, self._replica_numbers)
                 agents[agent] = [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
         return agents
 
-    def _others(
+    def other_actors(
         self, purpose: Purpose, *, worlds: int, replicas: int | None = None
-    ) -> dict[AgentIndices, nn.Module]:
-        """The actors of the agents that do not learn, with random numbers for a purpose; for so many
-        replicas, all by default. Scripted agents of one policy act as lanes of one actor, and agents of one
-        kind from one stored run."""
-        numbers = self._numbers[:replicas]
-        agents = {agent: of_replicas[: len(numbers)] for agent, of_replicas in self._stored.items()}
+    ) -> dict[ActorAgents, nn.Module]:
+        """Return the actors of the agents that do not learn, with random numbers for a purpose.
+
+        Scripted agents of one policy act as lanes of one actor, as do agents of one kind from one stored run.
+
+        Args:
+            replicas: the number of replicas; by default all.
+        """
+        numbers = self._replica_numbers[:replicas]
+        agents = {agent: stored[: len(numbers)] for agent, stored in self._stored_agents.items()}
         kinds = {
-            agent: (getattr(self._by_agent[agent], "run", None), of_replicas[0].kind)
-            for agent, of_replicas in agents.items()
+            agent: (getattr(self._specs_by_agent[agent], "run", None), stored[0].kind)
+            for agent, stored in agents.items()
         }
         seeds = partial(lane_seeds, self.seed, replicas=numbers, purpose=purpose)
         return stored_actors(agents, self.playing, kinds=kinds, seeds=seeds, worlds=worlds)
 
-    def _decisions(self) -> BanditDecider | None:
+    def _make_decider(self) -> BanditDecider | None:
         sizes = () if self._game is None else ballot_sizes(self._game)
         refuse_undecided(self.specs, len(sizes))
         if not sizes:
             return None
         bandits = [
             (spec.decisions or Bandit()) if isinstance(spec, Learning | Team) else None
-            for spec in self._by_agent
+            for spec in self._specs_by_agent
         ]
         return BanditDecider(
             sizes,
             bandits=bandits,
-            stored=decision_values(self._stored),
+            stored=decision_values(self._stored_agents),
             replicas=self.replicas,
             worlds=self.worlds,
             seed=self.seed,
-            first_replica=self._numbers.start,
+            first_replica=self._replica_numbers.start,
         )
 
-    def _learner(
+    def _make_learner(
         self, spec: Learning | Team, agents: tuple[int, ...], engine: Any, starts: bool
     ) -> AnyLearner:
+        start_from = self._start_weights(spec, agents) if starts else {}
         lanes = Lanes(
             self.spaces,
             agents=agents,
             replicas=self.replicas,
             worlds=self.worlds,
             seed=self.seed,
-            first_replica=self._numbers.start,
+            first_replica=self._replica_numbers.start,
             reward=spec.reward,
-            start_from=self._start_weights(spec, agents) if starts else {},
+            start_from=start_from,
             share_parameters=isinstance(spec, Team) and spec.share_parameters,
-            device=self._device,
+            device=self.device,
         )
         learner = _algorithm_of(spec).make_learner(lanes, engine)
         if learner.rewards.reward != spec.reward and not isinstance(spec.reward, str):
             raise ValueError(
-                f"reward is {reward_name(spec.reward)}, which the learner of {_name(spec)} does not have as "
-                "its `rewards`; allowed for it: 'individual', 'team'"
+                f"reward is {reward_name(spec.reward)}, which the learner of {_algorithm_name(spec)} does "
+                "not have as its `rewards`; allowed for it: 'individual', 'team'"
             )
         return learner
 
     def _start_weights(self, spec: Learning | Team, agents: tuple[int, ...]) -> dict[str, dict[str, Tensor]]:
-        """The state dict of the acting network with which each agent of each replica starts, by the lane's
-        name; empty where they start anew."""
+        """Return the weights with which the acting network of each agent of each replica starts, by the
+        lane's name; empty without `start_from`."""
         source = spec.start_from
         if source is None:
             return {}
-        run, algorithm = load(source.run), _algorithm_of(spec)
-        _refuse_unfitting(run, self.spaces, self._game)
+        run = load(source.run)
+        algorithm = _algorithm_of(spec)
+        _refuse_other_game(run, self.spaces, self._game)
         is_team = isinstance(spec, Team)
-        sources = _members(run, source, len(agents)) if is_team else (source.agent,) * len(agents)
+        sources = _team_of(run, source, len(agents)) if is_team else (source.agent,) * len(agents)
         weights = {}
-        for replica in self._numbers:
-            there = source.replica_for(replica)
+        for replica in self._replica_numbers:
+            stored_replica = source.replica_for(replica)
             for agent, stored_agent in zip(agents, sources, strict=True):
-                where = f"{lane_name(there, stored_agent)} of {source.run}"
-                stored = run.agent(stored_agent, replica=there)
-                weights[lane_name(replica, agent)] = _weights(stored, algorithm, self.spaces, where)
+                where = f"{lane_name(stored_replica, stored_agent)} of {source.run}"
+                stored = run.agent(stored_agent, replica=stored_replica)
+                weights[lane_name(replica, agent)] = _loadable_weights(stored, algorithm, self.spaces, where)
         return weights
 
 
 def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game: Game | None) -> None:
-    """Checks that no transform changed the windows that scripted policies read.
+    """Refuse transforms that change the windows which scripted policies read.
 
     Args:
-        groups: specifications, and the agent indices of each.
+        groups: specifications, each with its agent indices.
         spaces: what agents observe, transforms included.
-        game: what is played; None for a game that is not a `Game`.
+        game: the game; None for one that is not a `Game`.
     """
     if game is None or spaces == game.spaces:
         return
@@ -281,11 +278,11 @@ def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game
             )
 
 
-def _refuse_unfitting(
+def _refuse_other_game(
     run: LoadedRun, spaces: Spaces, game: Game | None, *, is_to_decide: bool = False
 ) -> None:
-    """Refuses a run that was trained for other observations or actions, or other ballots if its agents are to
-    decide here."""
+    """Refuse a run that was trained for other observations or actions, or for other ballots if
+    `is_to_decide`."""
     pairs: dict[str, tuple[Any, Any]] = {
         "observations": (run.spaces.observation_shape, spaces.observation_shape),
         "observations of the dtype": (run.spaces.observation_dtype, spaces.observation_dtype),
@@ -293,7 +290,7 @@ def _refuse_unfitting(
     }
     if game is not None and isinstance(run.game, Game):
         if is_to_decide and game.ballots:
-            pairs["ballots"] = _ballots(run.game), _ballots(game)
+            pairs["ballots"] = _ballot_choices(run.game), _ballot_choices(game)
         pairs |= {
             "a form of observation": (run.game.observation, game.observation),
             "actions": (run.game.actions, game.actions),
@@ -307,12 +304,12 @@ def _refuse_unfitting(
             raise ValueError(f"the agents of {run.path} have {name} {there}; this game has {here}")
 
 
-def _ballots(game: Game) -> list[tuple[str, tuple[float, ...]]]:
+def _ballot_choices(game: Game) -> list[tuple[str, tuple[float, ...]]]:
     return [(ballot.title, ballot.choices) for ballot in game.ballots]
 
 
-def _members(run: LoadedRun, source: Frozen, size: int) -> tuple[int, ...]:
-    """The agents of the team that the stored agent is in."""
+def _team_of(run: LoadedRun, source: Frozen, size: int) -> tuple[int, ...]:
+    """Return the agents of the team of a stored agent."""
     spec = run.specs[source.agent] if source.agent < len(run.specs) else None
     if not isinstance(spec, Team) or len(spec.agents) != size:
         where = f"in a team of {len(spec.agents)}" if isinstance(spec, Team) else "in no team"
@@ -323,32 +320,36 @@ def _members(run: LoadedRun, source: Frozen, size: int) -> tuple[int, ...]:
     return spec.agents
 
 
-def _weights(stored: StoredAgent, algorithm: Algorithm, spaces: Spaces, where: str) -> dict[str, Tensor]:
-    """The weights of a stored agent's network, if the algorithm's network computes the same with them."""
+def _loadable_weights(
+    stored: StoredAgent, algorithm: Algorithm, spaces: Spaces, where: str
+) -> dict[str, Tensor]:
+    """Return the weights of a stored agent's network; refuse them if the algorithm's network computes
+    something else with them."""
     name = type(algorithm).__name__
     if stored.network is None:
         raise ValueError(f"{where} is scripted, without weights; allowed: an agent that learned")
     if stored.stochastic != algorithm.stochastic:
-        outputs = {True: "the logits of a policy", False: "action values"}
+        meanings = {True: "the logits of a policy", False: "action values"}
         raise ValueError(
-            f"the network of {where} outputs {outputs[stored.stochastic]}; {name} learns "
-            f"{outputs[algorithm.stochastic]}"
+            f"the network of {where} outputs {meanings[stored.stochastic]}; {name} learns "
+            f"{meanings[algorithm.stochastic]}"
         )
     weights = stored.network.state_dict()
     with torch.random.fork_rng(devices=[]), torch.no_grad():
-        network = acting_part(algorithm.make_network(spaces))
+        network = acting_network(algorithm.make_network(spaces))
         try:
             network.load_state_dict(weights)
         except RuntimeError as error:
             reason = " ".join(str(error).split())
             raise ValueError(f"{where} has another network than {name} here: {reason}") from error
         torch.manual_seed(0)
-        seen = torch.rand(8, *spaces.observation_shape) * spaces.observation_scale
-        seen = seen.to(getattr(torch, spaces.observation_dtype))
+        observation = torch.rand(8, *spaces.observation_shape) * spaces.observation_scale
+        observation = observation.to(getattr(torch, spaces.observation_dtype))
         shape = state_shape_of(network)
         state = () if shape is None else (torch.zeros(8, *shape),)
-        outputs_here, outputs_there = network(seen, *state), stored.network(seen, *state)
-        pairs = zip(outputs_here, outputs_there, strict=True) if state else [(outputs_here, outputs_there)]
+        outputs = network(observation, *state)
+        stored_outputs = stored.network(observation, *state)
+        pairs = zip(outputs, stored_outputs, strict=True) if state else [(outputs, stored_outputs)]
         if not all(torch.equal(*pair) for pair in pairs):
             raise ValueError(
                 f"{where} has another network than {name} here: with the same weights the outputs differ"
@@ -357,18 +358,18 @@ def _weights(stored: StoredAgent, algorithm: Algorithm, spaces: Spaces, where: s
 
 
 def _algorithm_of(spec: Learning | Team) -> Algorithm:
-    """The algorithm of a specification; refuses code of the user's own that is none."""
+    """Return the algorithm of a specification; refuse user code that is no algorithm."""
     is_sharing = isinstance(spec, Team) and spec.share_parameters
     kind = TeamAlgorithm if isinstance(spec, Team) and not is_sharing else Algorithm
-    algorithm = made(spec.algorithm)
+    algorithm = instantiate(spec.algorithm)
     if not isinstance(algorithm, kind):
         raise ValueError(
-            f"the algorithm of {_name(spec)} is a {type(algorithm).__name__}; allowed: a subclass of "
-            f"cprl.algorithms.{kind.__name__}"
+            f"the algorithm of {_algorithm_name(spec)} is a {type(algorithm).__name__}; allowed: a subclass "
+            f"of cprl.algorithms.{kind.__name__}"
         )
     refuse_sharing(algorithm, is_sharing)
     return algorithm
 
 
-def _name(spec: Learning | Team) -> str:
+def _algorithm_name(spec: Learning | Team) -> str:
     return spec.algorithm.target if isinstance(spec.algorithm, Custom) else type(spec.algorithm).__name__

@@ -1,4 +1,4 @@
-"""What a training keeps of its learners, episode by episode, and whom it accepts."""
+"""What a training keeps of its learners in each episode, and checks of its agents."""
 
 from collections.abc import Mapping, Sequence
 from math import nan
@@ -10,30 +10,30 @@ from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
 from cprl.keys import Turn
-from cprl.learners.base import AnyLearner
-from cprl.policies.assignment import AgentIndices, agent_indices
+from cprl.learners.protocol import AnyLearner
 from cprl.policies.decisions import Decider
-from cprl.values.arrays import Float64
+from cprl.policies.joint_policy import ActorAgents, agent_indices
+from cprl.values.array_types import Float64
 
 Learners: TypeAlias = Mapping[tuple[int, ...], AnyLearner]
-"""By the indices of their agents."""
+"""Learners, by the indices of their agents."""
 
 
 class LaneLosses:
-    """Mean losses of S agents since the end of each replica's last episode."""
+    """The mean losses of S agents since the end of each replica's last episode."""
 
     def __init__(self, replicas: int, agents: tuple[int, ...]) -> None:
         self.total = np.zeros((replicas, len(agents)), np.float64)
         self.updates = np.zeros(replicas, np.int64)
 
     def add(self, loss: Tensor | None) -> None:
-        """Adds the losses of an update, [R, S]; None if there was no update."""
+        """Add the losses of an update, [R, S]; None if there was no update."""
         if loss is not None:
             self.total += loss.numpy(force=True)
             self.updates += 1
 
     def take(self, replica: int) -> list[float]:
-        """Returns the mean loss of each agent of a replica, NaN without an update, and resets the replica."""
+        """Return the mean loss of each agent of a replica, NaN without an update, and reset the replica."""
         means: list[float] = (self.total[replica] / (self.updates[replica] or nan)).tolist()
         self.total[replica] = 0.0
         self.updates[replica] = 0
@@ -43,14 +43,15 @@ class LaneLosses:
         return {"total": torch.tensor(self.total), "updates": torch.tensor(self.updates)}
 
     def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
-        self.total[:], self.updates[:] = state["total"].numpy(), state["updates"].numpy()
+        self.total[:] = state["total"].numpy()
+        self.updates[:] = state["updates"].numpy()
 
 
-class WantedReturns:
-    """The sums of the rewards that agents want, over the running episode of each world.
+class ShapedReturns:
+    """The shaped returns of the running episode of each world: sums of the rewards that agents learn from.
 
     Args:
-        worlds: of all replicas, B.
+        worlds: the worlds of all replicas, B.
         agents: the number of agents N; those that do not learn have NaN.
     """
 
@@ -65,14 +66,14 @@ class WantedReturns:
         self.returns = np.tile(self._first, (worlds, 1))
 
     def add(self) -> None:
-        """Adds the turn that the learners have just stored."""
+        """Add the rewards of the turn that the learners have just stored."""
         for columns, rewards in self._rewards:
-            turn = rewards.now
+            turn = rewards.latest
             turn = turn.numpy(force=True) if isinstance(turn, Tensor) else turn
             self.returns[:, columns] += turn[:, columns]
 
     def take(self, world: int) -> Float64:
-        """The wanted return of each agent of a world, [N], whose next episode begins at 0."""
+        """Return the shaped return of each agent of a world, [N], and reset it to 0."""
         taken: Float64 = self.returns[world].copy()
         self.returns[world] = self._first
         return taken
@@ -84,24 +85,25 @@ class WantedReturns:
         self.returns[:] = state["returns"].numpy()
 
 
-def learned_in(
+def learning_numbers(
     ended: Sequence[int],
     turn: Turn,
     learners: Learners,
     losses: Mapping[tuple[int, ...], LaneLosses],
     worlds: int,
 ) -> list[dict[str, float]]:
-    """What was learned in the episodes that have just ended, by agent: "loss", the mean since its replica
-    last ended an episode, which begins anew; "epsilon"; and "q", the value of the state.
+    """Return the numbers of learning of the episodes that have just ended, by agent: "loss", the mean since
+    the replica's last episode, which is reset; "epsilon"; and "q", the value of the state.
 
     Args:
         ended: the worlds in which they ended, each once.
-        turn: the last one of theirs.
+        turn: their last turn.
         worlds: the worlds W of each replica.
     """
     learned: list[dict[str, float]] = [{} for _ in ended]
+    replicas = {world // worlds for world in ended}
     for agents, learner in learners.items():
-        means = {replica: losses[agents].take(replica) for replica in {world // worlds for world in ended}}
+        means = {replica: losses[agents].take(replica) for replica in replicas}
         values = learner.values(turn).tolist()
         for world, numbers in zip(ended, learned, strict=True):
             for place, agent in enumerate(agents):
@@ -116,18 +118,18 @@ def check_agents(
     agents: int,
     worlds: int,
     learners: Learners,
-    others: Mapping[AgentIndices, nn.Module],
+    others: Mapping[ActorAgents, nn.Module],
 ) -> int:
     """Return the number of replicas R; raise a ValueError unless each of N agents has one learner or actor,
-    in W worlds of each replica."""
+    for W worlds of each replica."""
     everywhere: int = env.batch_size.numel()
     replicas, left = divmod(everywhere, worlds)
     if left:
         raise ValueError(f"worlds is {worlds}; allowed: a divisor of the environment's {everywhere} worlds")
     taken = sorted(agent for indices in [*learners, *others] for agent in agent_indices(indices))
-    if taken != (wanted := list(range(agents))):
+    if taken != list(range(agents)):
         raise ValueError(
-            f"learners and others control the agents {taken}; allowed: each of {wanted} exactly once"
+            f"learners and others control the agents {taken}; allowed: each of 0 to {agents - 1} exactly once"
         )
     for indices, learner in learners.items():
         if learner.agents != agent_indices(indices):
@@ -141,11 +143,11 @@ def check_agents(
 
 
 def check_decisions(decisions: Decider | None, options: int) -> None:
-    """Raises a ValueError unless there is a Decider where agents have so many options, and none for 0."""
-    if bool(options) != (decisions is not None):
-        asks, allowed = ("vote or elect", "a Decider, e.g. Population(...).decisions")
-        if not options:
-            asks, allowed = "decide nothing", "None"
+    """Raise a ValueError if agents have options on ballots but no Decider, or a Decider but no options."""
+    if options and decisions is None:
         raise ValueError(
-            f"decisions is {decisions and 'a Decider'}; allowed for a game whose agents {asks}: {allowed}"
+            "decisions is None; allowed for a game whose agents vote or elect: a Decider, e.g. "
+            "Population(...).decisions"
         )
+    if decisions is not None and not options:
+        raise ValueError("decisions is a Decider; allowed for a game whose agents decide nothing: None")

@@ -1,10 +1,11 @@
-"""run: one experiment from its learners to its report: train, save, evaluate in fresh worlds, summarise."""
+"""run: train an experiment, save its agents, evaluate them in fresh worlds, and report."""
 
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,28 +14,29 @@ import torch
 from torchrl.envs import EnvBase
 
 from cprl.commons.threads import MOST_THREADS
-from cprl.envs.state import transforms_state
+from cprl.envs.env_state import transforms_state
 from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
-from cprl.experiment.engine import about_engine, begun_with, engine_of
-from cprl.measuring.episodes import Episode, try_own_metrics
-from cprl.measuring.table import labelled, naming, where
+from cprl.experiment.engine import about_engine, begun_with, engine_of, planned_updates
+from cprl.learners.protocol import AnyLearner
+from cprl.measuring.table import labelled, store_agent_names, where
+from cprl.measuring.tracker import Episode, try_custom_metrics
 from cprl.population import exploration_steps, partners_in
-from cprl.runs.checkpoints import FOLDER, Checkpointer, checkpoints_in, endings_of
+from cprl.runs.checkpoints import CHECKPOINTS, Checkpointer, endings_of
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.files import LOCK_FILE, REPORT, RunLockedError, refuse_missing, write_json
 from cprl.runs.length import Length
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
 from cprl.runs.recipe import (
     refuse_another_run,
-    say_changes,
+    warn_of_changes,
     write_circumstances,
     write_metrics,
     write_on_nan,
 )
 from cprl.runs.states import (
     KEEPS_NO_STATE,
-    State,
+    RunState,
     Step,
     extend,
     next_step,
@@ -45,38 +47,38 @@ from cprl.runs.states import (
 from cprl.runs.weights import (
     DECISIONS,
     TRANSFORMS,
+    frozen_weights_names,
     save_beside_weights,
     save_weights,
-    weights_that_played,
 )
-from cprl.system.compiling import cleared_up
-from cprl.system.output import RESUMES, console, say
+from cprl.system.compiling import freed_after_training
+from cprl.system.output import RESUME_PREFIX, console, say
 from cprl.system.process import prepare_process
 from cprl.system.times import Times
+from cprl.system.waiting_room import experimental
 from cprl.system.working import working
 from cprl.terminal.course import NEEDED, course_of
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
 from cprl.training.agents import Population
-from cprl.training.finite import summary
-from cprl.training.outcome import (
+from cprl.training.evaluating import (
     Evaluations,
     evaluate_population,
-    exhibited,
     make_agents,
     random_play,
     write_evaluation,
 )
+from cprl.training.nan_check import findings_note
 from cprl.training.training import Training, check_callbacks, train
-from cprl.values import Custom, Range, checked, made
+from cprl.values import Custom, Range, checked, instantiate
 from cprl.viewer.page import check_watch
 
 if TYPE_CHECKING:
     from cprl.viewer.callback import ViewerCallback
 
 
-@cleared_up()
+@freed_after_training()
 def run(
     experiment: Experiment,
     out: Path | str | None = None,
@@ -92,32 +94,32 @@ def run(
 ) -> Path:
     """Train the agents of all replicas, evaluate them in fresh worlds, and write and print the outcome.
 
-    A run that ends before its training has begun leaves nothing behind; later, all that it produced. With
-    `resume`, what is done depends on what `out` says, see `cprl.runs.states`:
+    If the run fails before its training begins, it leaves no files; later, it keeps all files, so that it can
+    be resumed. With `resume`, the next step follows from the files in `out` and from the requested length, in
+    episodes or steps, see `cprl.runs.states`:
 
-    | it has                 | it is    | as many episodes, or steps  | more of them                 |
-    |------------------------|----------|-----------------------------|------------------------------|
-    | recipe.json            | begun    | resume: from the first step | extend: resume, to be longer |
-    | checkpoints/training-* | stopped  | resume: from the newest     | extend: resume, to be longer |
-    | report.json            | finished | tidy: say that it is        | extend: from its ending-*    |
+    | files in `out`         | state    | the same length         | a greater length: extend it, then |
+    |------------------------|----------|-------------------------|-----------------------------------|
+    | recipe.json            | begun    | train from step 0       | train from step 0                 |
+    | checkpoints/training-* | stopped  | train from the last one | train from the last one           |
+    | report.json            | finished | print that it is        | train from checkpoints/ending-*   |
 
     Args:
         out: the directory of the run, new or empty; by default `runs/<name>-<time>`.
-        resume: whether the run in `out`, which was stopped, is resumed from its newest checkpoint, or a run
-            of fewer episodes, stopped or finished, is extended. Either equals, bit for bit, a run that was
-            not interrupted, by the engine with which it began: with engine="auto" a longer run may begin
-            with another. Of a finished run of as many episodes nothing is done.
+        resume: whether to resume the stopped run in `out`, or to extend a run of fewer episodes or steps. The
+            result equals, bit for bit, that of a run without interruption by the same engine. With
+            engine="auto" the engine stays the one with which the run began.
         take_over: whether to resume a run that a process on another host has locked.
         keep_checkpoint: whether a finished run keeps the state of its training, so that it can be extended:
             hundreds of megabytes, buffers included.
-        watch: "file" for a recording for the Rerun viewer; "serve" or "spawn" to watch
-            live as well, see `cprl.viewer.live.Live`; "off" for none.
-        linger: whether the recording stays served after the run, until Ctrl-C (SIGINT) or SIGTERM; only with
+        watch: "file" records the run for the Rerun viewer; "serve" and "spawn" also show it live, see
+            `cprl.viewer.live.Live`; "off" records nothing.
+        linger: whether to serve the recording after the run, until Ctrl-C (SIGINT) or SIGTERM; only with
             `watch` "serve" or "spawn".
-        threads: torch's threads. Several are faster for large minibatches of many worlds, if no other
-            program wants the cores; numbers then differ in their last bits.
-        callbacks: further callbacks of this process (see `cprl.training.Callback`), which the recipe does
-            not hold; they may look, and change nothing.
+        threads: the number of torch's threads. Several are faster for large minibatches of many worlds, if no
+            other program needs the cores; results then differ in their last bits.
+        callbacks: more callbacks, see `cprl.training.Callback`. The recipe does not hold them, so they may
+            observe the training but not change it.
         figures: whether the training curve is drawn; a study draws its own.
 
     Returns:
@@ -125,89 +127,137 @@ def run(
         `evaluation/`, `figures/`, `manifest.json` with their checksums, and `report.json`.
 
     Raises:
-        RunLockedError: where another process writes the run.
-        KeyboardInterrupt: after the first SIGINT (Ctrl-C), when the state is saved and the line that resumes
-            is said; the second ends the process at once.
-        SystemExit: with code 143 after SIGTERM, likewise.
-        FileExistsError: where `out` is not empty and `resume` is not given.
-        OSError: for a full disk or a deleted directory; the message names it. What was written before is
-            intact, and the run can be resumed.
+        RunLockedError: if another process writes the run.
+        KeyboardInterrupt: after the first SIGINT (Ctrl-C), once the state is saved and the command that
+            resumes the run is printed. A second SIGINT ends the process at once.
+        SystemExit: with code 143 after SIGTERM, in the same way.
+        FileExistsError: if `out` is not empty and `resume` is False.
+        OSError: for a full disk or a deleted directory, which the message names. Earlier files are intact,
+            and the run can be resumed.
     """
     times = Times()
     _prepare(experiment, watch, linger=linger, threads=threads)
-    out = None if out is None else Path(out)
-    is_new = out is None or not out.exists()
-    resumed = out if resume else None
-    asked = experiment
-    experiment = _with_engine(experiment, resumed)
-    state, length, step = _due(out, experiment, resume=resume)
-    with working("making agents"):
-        partners = partners_in(experiment.agents)
-        weights = {} if resumed is None else weights_that_played(resumed, partners)
-        env, population = make_agents(experiment, starts=state in ("missing", "begun"), weights=weights)
-    observers: list[Any] = [*map(made, experiment.callbacks), *callbacks]
-    check_callbacks(observers)
-    words = try_own_metrics(experiment.metrics, env)
-    directory = start(out, experiment, partners) if resumed is None else resumed
-    if step == "tidy" and not (directory / LOCK_FILE).exists():
-        return _is_finished(directory, experiment)
+    opened = _open_run(experiment, out, resume=resume, callbacks=callbacks)
+    directory = opened.directory
+    if opened.step == "already_finished" and not (directory / LOCK_FILE).exists():
+        return _say_finished(directory, opened.experiment)
     checkpointer = Checkpointer(directory, keep_ending=keep_checkpoint, take_over=take_over)
-    with ExitStack() as closing:  # of the viewer, which outlives the rest
-        with _left_behind(checkpointer, closing, step, is_new=is_new), checkpointer:
-            # Another process may have finished or extended the run meanwhile.
-            state, length, step = _due(out, experiment, resume=resume)
-            if step == "tidy":
-                _is_finished(directory, experiment)
+    with ExitStack() as viewer_stack:  # the viewer stays open after the checkpointer has unlocked the run
+        with _cleaned_up(checkpointer, viewer_stack, opened), checkpointer:
+            if not _begin(opened):
                 checkpointer.done()
                 return directory
-            if step == "extend":
-                refuse_to_extend(directory, length, observers)
-            if step != "start":
-                _begin_again(directory, experiment, state, length)
-            _say_engine(asked, experiment, state)
-            write_metrics(directory, words)
-            viewer = closing.enter_context(_make_viewer(watch, directory, experiment, env, population))
-            watching = [] if viewer is None else [viewer]
-            random = _play_at_random(experiment, population, viewer)
-            with _loggers(experiment, directory, resumes=resume) as loggers:
-                seeing = [*observers, *watching, *loggers]
-                training = _train(experiment, directory, env, population, seeing, checkpointer)
-            played = _evaluate(experiment, directory, env, population, viewer, random)
-            table = _table(env, population, played)
-            figure = _draw(experiment, directory, training, table) if figures else None
-            _write_report(directory, training, times)
-            _summarise(experiment, directory, training, table, figure)
+            viewer = viewer_stack.enter_context(_make_viewer(watch, opened))
+            _Stages(opened, viewer).take_all(checkpointer, times, figures=figures)
             checkpointer.done()
-            _say_what_is_kept(experiment, directory)
-        for callback in observers:
-            if hasattr(callback, "on_finished"):
-                callback.on_finished(directory)
+            _say_kept_state(opened)
+        for observer in opened.observers:
+            if hasattr(observer, "on_finished"):
+                observer.on_finished(directory)
         if linger and viewer is not None:
             viewer.linger()
     return directory
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _OpenRun:
+    """A run whose directory, worlds and agents exist, before its training begins."""
+
+    requested: Experiment
+    """The experiment of the caller, whose engine may be "auto"."""
+    experiment: Experiment
+    """The experiment with the engine that trains it."""
+    resume: bool
+    """True for a run that is resumed or extended, False for a new one."""
+    directory: Path
+    is_new: bool
+    """True if the directory did not exist before."""
+    step: Step
+    """The step that was due when the run was opened."""
+    env: EnvBase
+    population: Population
+    observers: Sequence[Any]
+    """The callbacks of the experiment and of the caller."""
+    metric_words: Mapping[str, Mapping[str, str]]
+    """The "title" and "unit" of custom metrics."""
+
+
+def _open_run(
+    requested: Experiment, out: Path | str | None, *, resume: bool, callbacks: Sequence[object]
+) -> _OpenRun:
+    """Make the worlds, the agents and the directory of a run; refuse what would fail later."""
+    out = None if out is None else Path(out)
+    is_new = out is None or not out.exists()
+    resumed = out if resume else None
+    experiment = _with_engine(requested, resumed)
+    state, _, step = _find_next_step(out, experiment, resume=resume)
+    with working("making agents"):
+        partners = partners_in(experiment.agents)
+        weights = {} if resumed is None else frozen_weights_names(resumed, partners)
+        env, population = make_agents(experiment, starts=state in ("missing", "begun"), weights=weights)
+    observers = [*map(instantiate, experiment.callbacks), *callbacks]
+    check_callbacks(observers)
+    metric_words = try_custom_metrics(experiment.metrics, env)
+    return _OpenRun(
+        requested=requested,
+        experiment=experiment,
+        resume=resume,
+        directory=start(out, experiment, partners) if resumed is None else resumed,
+        is_new=is_new,
+        step=step,
+        env=env,
+        population=population,
+        observers=observers,
+        metric_words=metric_words,
+    )
+
+
+def _begin(run: _OpenRun) -> bool:
+    """Prepare the locked directory for the training; return False if the run turns out to be finished.
+
+    The state of the directory is read again, because another process may have finished or extended the run
+    before this one locked it.
+    """
+    state, length, step = _find_next_step(run.directory, run.experiment, resume=run.resume)
+    if step == "already_finished":
+        _say_finished(run.directory, run.experiment)
+        return False
+    if step == "extend":
+        refuse_to_extend(run.directory, length, run.observers)
+    if step != "start":
+        _prepare_to_resume(run.directory, run.experiment, state, length)
+    _say_engine(run.requested, run.experiment, state)
+    write_metrics(run.directory, run.metric_words)
+    return True
+
+
 def _with_engine(experiment: Experiment, resumed: Path | None) -> Experiment:
-    """Return an experiment with the engine that trains it in place of "auto": the one with which the run
-    began that is resumed or extended, so that its numbers are those of a whole run by that engine."""
+    """Return the experiment with the engine that trains it in place of "auto".
+
+    A resumed run keeps the engine with which it began, so that its numbers equal those of an uninterrupted
+    run.
+    """
     if experiment.engine != "auto":
         return experiment
     begun = None if resumed is None else begun_with(resumed)
     return replace(experiment, engine=begun or engine_of(experiment))
 
 
-def _say_engine(asked: Experiment, experiment: Experiment, state: State) -> None:
-    """Says which engine "auto" stands for, of a training that begins, or one that began with another."""
-    if asked.engine != "auto":
+def _say_engine(requested: Experiment, experiment: Experiment, state: RunState) -> None:
+    """Print which engine "auto" stands for, when a training begins, or resumes with another than it would
+    choose now."""
+    if requested.engine != "auto":
         return
-    if experiment.engine != engine_of(asked):
+    if experiment.engine != engine_of(requested):
         say(f'Trains with engine="{experiment.engine}", as the run began.')
-    elif state in ("missing", "begun") and (sentence := about_engine(asked)):
-        say(sentence)
+    elif state in ("missing", "begun") and planned_updates(requested):
+        say(about_engine(requested))
 
 
-def _due(out: Path | None, experiment: Experiment, *, resume: bool) -> tuple[State, Length, Step]:
-    """Return what the directory of a run says, how long the run is so far, and what is to be done there."""
+def _find_next_step(
+    out: Path | None, experiment: Experiment, *, resume: bool
+) -> tuple[RunState, Length, Step]:
+    """Return the state of a run's directory, the run's length so far, and the next step."""
     if not resume:
         return "missing", experiment.length, "start"
     length = refuse_another_run(out, experiment.to_recipe, Experiment)
@@ -216,17 +266,21 @@ def _due(out: Path | None, experiment: Experiment, *, resume: bool) -> tuple[Sta
 
 
 def _prepare(experiment: Experiment, watch: str, *, linger: bool, threads: int) -> None:
-    """Refuses what nobody could watch or log to, and prepares the process."""
+    """Check the viewer and the loggers, and prepare the process."""
     check_watch(watch, linger=linger)
     for logger in experiment.loggers:
-        check_logger(logger.resolve() if isinstance(logger, Custom) else logger)
+        if isinstance(logger, Custom):
+            logger.resolve()
+        else:
+            check_logger(logger)
     threads = checked("threads", threads, Annotated[int, Range(1, MOST_THREADS)])
     prepare_process(experiment.seed, threads=threads)
 
 
-def _begin_again(run: Path, experiment: Experiment, state: State, length: Length) -> None:
-    """Says what is new since a run was begun that is so long, and writes it into its recipe."""
-    say_changes(run, write_circumstances(run))
+def _prepare_to_resume(run: Path, experiment: Experiment, state: RunState, length: Length) -> None:
+    """Print what has changed since a run was begun, record it in the recipe, and extend the run if it shall
+    be longer."""
+    warn_of_changes(run, write_circumstances(run))
     if state == "begun":
         say("No checkpoint yet: begins with the first episode")
     write_on_nan(run, experiment.on_nan)
@@ -234,8 +288,8 @@ def _begin_again(run: Path, experiment: Experiment, state: State, length: Length
         extend(run, length, experiment.length)
 
 
-def _is_finished(run: Path, experiment: Experiment) -> Path:
-    """Says that a run is finished, and what it lost since."""
+def _say_finished(run: Path, experiment: Experiment) -> Path:
+    """Print that a run is finished; refuse one that has lost files."""
     refuse_missing(run)
     more = f"with more {experiment.length.flag} it is extended" if endings_of(run) else KEEPS_NO_STATE
     console().print(f"{run} is finished; {more}", soft_wrap=True)
@@ -243,29 +297,32 @@ def _is_finished(run: Path, experiment: Experiment) -> Path:
 
 
 @contextmanager
-def _left_behind(
-    checkpointer: Checkpointer, closing: ExitStack, step: Step, *, is_new: bool
-) -> Iterator[None]:
-    """What an error in the block leaves: of a training that has begun everything, and the line that resumes
-    it; of a run that was to start nothing, not even its directory if that is new."""
-    resumes = f"{RESUMES}{checkpointer.resume_command}"
+def _cleaned_up(checkpointer: Checkpointer, viewer_stack: ExitStack, run: _OpenRun) -> Iterator[None]:
+    """Clean up if the block raises an error, after its viewer is closed.
+
+    If the training has begun, all files stay, and the error says how to resume. If a new run fails before
+    its training begins, its files are removed, and its directory too if it did not exist before.
+    """
+    resumes = f"{RESUME_PREFIX}{checkpointer.resume_command}"
+    is_new_run = run.step == "start"
     try:
         yield
     except BaseException as error:
-        closing.close()
+        viewer_stack.close()
         is_stopped = isinstance(error, KeyboardInterrupt | SystemExit)
-        if checkpointer.has_begun or (step != "start" and isinstance(error, OSError)):
+        if checkpointer.has_begun or (not is_new_run and isinstance(error, OSError)):
             error.add_note(resumes)
-        elif step != "start" and is_stopped:
+        elif not is_new_run and is_stopped:
             say(resumes)
-        elif step == "start" and not isinstance(error, RunLockedError):
-            _remove(checkpointer.run, with_directory=is_new)
+        elif is_new_run and not isinstance(error, RunLockedError):
+            _remove_files(checkpointer.run, with_directory=run.is_new)
             if is_stopped:
                 say("Stopped before the training began: nothing was written.")
         raise
 
 
-def _remove(directory: Path, *, with_directory: bool) -> None:
+def _remove_files(directory: Path, *, with_directory: bool) -> None:
+    """Remove the content of a directory, as far as that is possible, and the directory too if asked to."""
     with suppress(OSError):
         for path in directory.iterdir():
             if path.is_dir():
@@ -276,97 +333,138 @@ def _remove(directory: Path, *, with_directory: bool) -> None:
             directory.rmdir()
 
 
-def _play_at_random(
-    experiment: Experiment, population: Population, viewer: "ViewerCallback | None"
-) -> list[Episode] | None:
-    """Shows in the viewer what random play gets, with which the training is compared; None without one."""
-    if viewer is None:
-        return None
-    episodes = random_play(experiment, population, seen=viewer.seen_at_random)
-    viewer.random_play(episodes)
-    return episodes
-
-
 @contextmanager
 def _loggers(experiment: Experiment, directory: Path, *, resumes: bool) -> Iterator[list[LoggerCallback]]:
-    """Within the block the experiment's loggers are open."""
+    """Keep the experiment's loggers open within the block."""
     with ExitStack() as stack:
-        loggers = [make_logger(made(logger), directory) for logger in experiment.loggers]
+        loggers = [make_logger(instantiate(logger), directory) for logger in experiment.loggers]
         yield [stack.enter_context(LoggerCallback(logger, resumes=resumes)) for logger in loggers]
 
 
-def _train(
-    experiment: Experiment,
-    directory: Path,
-    env: EnvBase,
-    population: Population,
-    callbacks: Sequence[Any],
-    checkpointer: Checkpointer,
-) -> Training:
-    """Trains, writes the table of episodes and shows the progress meanwhile, and saves what was learned."""
-    evaluations = Evaluations(directory, experiment, env, population)
-    episodes = EpisodeTable(directory / "episodes.parquet", resumable=True)
-    with episodes, ProgressBar.of(experiment) as bar:
-        training = train(
-            env,
-            population.learners,
-            experiment.schedule,
-            others=population.others,
-            decisions=population.decisions,
-            callbacks=[evaluations, episodes, bar, *callbacks],
-            metrics=experiment.metrics,
-            checkpointer=checkpointer,
-        )
+@dataclass(frozen=True, eq=False)
+class _Stages:
+    """The stages of an open run: random play, training, evaluation, and the report."""
+
+    run: _OpenRun
+    viewer: "ViewerCallback | None"
+
+    def take_all(self, checkpointer: Checkpointer, times: Times, *, figures: bool) -> None:
+        """Take all stages, from random play to the printed summary."""
+        random_episodes = self.play_at_random()
+        training = self.train(checkpointer)
+        evaluation = self.evaluate(random_episodes)
+        figure = self.draw_curve(training, evaluation) if figures else None
+        _write_report(self.run.directory, training, times)
+        self.summarise(training, evaluation, figure)
+
+    def play_at_random(self) -> list[Episode] | None:
+        """Play at random, for comparison with the training, and show it in the viewer.
+
+        Returns:
+            The episodes; None without a viewer, since nobody would see them during the training.
+        """
+        if self.viewer is None:
+            return None
+        episodes = random_play(self.run.experiment, self.run.population, seen=self.viewer.seen_at_random)
+        self.viewer.random_play(episodes)
+        return episodes
+
+    def train(self, checkpointer: Checkpointer) -> Training:
+        """Train, and save what the agents have learned."""
+        run = self.run
+        viewers = [] if self.viewer is None else [self.viewer]
+        evaluations = Evaluations(run.directory, run.experiment, run.env, run.population)
+        with _loggers(run.experiment, run.directory, resumes=run.resume) as loggers:
+            table = EpisodeTable(run.directory / "episodes.parquet", resumable=True)
+            with table, ProgressBar.of(run.experiment) as progress_bar:
+                training = train(
+                    run.env,
+                    run.population.learners,
+                    run.experiment.schedule,
+                    others=run.population.others,
+                    decisions=run.population.decisions,
+                    callbacks=[evaluations, table, progress_bar, *run.observers, *viewers, *loggers],
+                    metrics=run.experiment.metrics,
+                    checkpointer=checkpointer,
+                )
+                self.save_learned()
+        return training
+
+    def save_learned(self) -> None:
+        """Save the weights of the agents' networks, and the states of transforms and decisions."""
+        directory = self.run.directory
+        population = self.run.population
         save_weights(directory, population.networks())
-        save_beside_weights(directory, TRANSFORMS, transforms_state(env))
+        save_beside_weights(directory, TRANSFORMS, transforms_state(self.run.env))
         if population.decisions is not None:
             save_beside_weights(directory, DECISIONS, population.decisions.learned())
-    return training
+
+    def evaluate(self, random_episodes: list[Episode] | None) -> pa.Table:
+        """Let the agents play fresh worlds, write their episodes, and show them in the viewer.
+
+        Args:
+            random_episodes: the episodes of `play_at_random`.
+
+        Returns:
+            The episodes of random play and of the trained agents, labelled by "policy".
+        """
+        run = self.run
+        if self.viewer is not None:
+            self.viewer.flush()
+        episodes = evaluate_population(run.experiment, run.env, run.population, random=random_episodes)
+        tables = write_evaluation(run.directory, episodes, replicas=run.experiment.replicas)
+        if self.viewer is not None:
+            self.viewer.finished(episodes)
+        trained = _trained_label(list(run.population.learners.values()))
+        random_table = labelled(tables["random"], policy="random")
+        trained_table = labelled(tables["trained"], policy=trained)
+        return store_agent_names(pa.concat_tables([random_table, trained_table]), agent_names(run.env))
+
+    @working("drawing the training curve")
+    def draw_curve(self, training: Training, evaluation: pa.Table) -> Path | None:
+        """Draw the training curve, and return its file; None if a replica has ended no episode."""
+        experiment = self.run.experiment
+        if not all(training.episodes_by_replica):
+            say(f"No training curve: a replica has ended no episode in {training.steps:,} steps")
+            return None
+        steps = exploration_steps(experiment.agents)
+        return training_curve(
+            self.run.directory,
+            title=experiment.title,
+            random=where(evaluation, policy="random"),
+            exploration_turns=None if steps is None else steps / experiment.worlds,
+        )
+
+    def summarise(self, training: Training, evaluation: pa.Table, figure: Path | None) -> None:
+        """Print the summary of the run."""
+        experiment = self.run.experiment
+        notes = filter(None, (findings_note(training.finite.reported), experiment.custom_code))
+        course = ""
+        if all(training.episodes_by_replica) and set(NEEDED) <= set(evaluation.column_names):
+            course = course_of(self.run.directory, experiment.agents)
+        summarise(
+            self.run.directory,
+            title=experiment.title,
+            played=evaluation,
+            course=course,
+            figure=figure,
+            note="\n".join(notes) or None,
+        )
 
 
-def _evaluate(
-    experiment: Experiment,
-    directory: Path,
-    env: EnvBase,
-    population: Population,
-    viewer: "ViewerCallback | None",
-    random: list[Episode] | None,
-) -> dict[str, pa.Table]:
-    """Lets the agents play fresh worlds, writes their episodes, and shows them in the viewer."""
-    if viewer is not None:
-        viewer.flush()
-    played = evaluate_population(experiment, env, population, random=random)
-    tables = write_evaluation(directory, played, replicas=experiment.replicas)
-    if viewer is not None:
-        viewer.finished(played)
-    return tables
+def _trained_label(learners: Sequence[AnyLearner]) -> str:
+    """Return the label of trained agents in tables, with the epsilons of those that explore by one.
 
-
-def _table(env: EnvBase, population: Population, played: Mapping[str, pa.Table]) -> pa.Table:
-    """Return the episodes of the evaluation as one table, labelled by "policy": random play, and
-    trained, where any agent learns, with the probability with which those with action values explore;
-    others draw from a policy."""
-    learners = population.learners.values()
-    chances = {learner.settings.epsilon_evaluation for learner in learners if not learner.actor.stochastic}
-    trained = "trained" + "".join(f", epsilon {chance:g}" for chance in sorted(chances))
-    names = {"random": "random", "trained": trained if learners else "agents"}
-    table = pa.concat_tables(labelled(played[policy], policy=name) for policy, name in names.items())
-    return naming(table, agent_names(env))
-
-
-@working("drawing the training curve")
-def _draw(experiment: Experiment, directory: Path, training: Training, played: pa.Table) -> Path | None:
-    if not all(training.episodes_by_replica):
-        say(f"No training curve: a replica has ended no episode in {training.steps:,} steps")
-        return None
-    steps = exploration_steps(experiment.agents)
-    ends = None if steps is None else steps / experiment.worlds
-    random = where(played, policy="random")
-    return training_curve(directory, title=experiment.title, random=random, exploration_turns=ends)
+    Examples: "trained", "trained, epsilon 0.05", "agents" if no agent learns.
+    """
+    if not learners:
+        return "agents"
+    epsilons = {learner.settings.epsilon_evaluation for learner in learners if not learner.actor.stochastic}
+    return "".join(["trained", *(f", epsilon {epsilon:g}" for epsilon in sorted(epsilons))])
 
 
 def _write_report(directory: Path, training: Training, times: Times) -> None:
-    """Writes `report.json`, the sign that a run is finished."""
+    """Write `report.json`, which marks the run as finished."""
     length = training.schedule.length
     episodes = training.episodes_by_replica if length.is_of_steps else length.number
     report: dict[str, Any] = {
@@ -382,36 +480,22 @@ def _write_report(directory: Path, training: Training, times: Times) -> None:
     write_json(directory / REPORT, report)
 
 
-def _summarise(
-    experiment: Experiment, directory: Path, training: Training, played: pa.Table, figure: Path | None
-) -> None:
-    """Print the outcome."""
-    notes = filter(None, (summary(training.finite.reported), experiment.own_code))
-    has_course = all(training.episodes_by_replica) and set(NEEDED) <= set(played.column_names)
-    summarise(
-        directory,
-        title=experiment.title,
-        played=played,
-        course=course_of(directory, experiment.agents) if has_course else "",
-        figure=figure,
-        note="\n".join(notes) or None,
-    )
-
-
-def _make_viewer(
-    watch: str, directory: Path, experiment: Experiment, env: EnvBase, population: Population
-) -> "AbstractContextManager[ViewerCallback | None]":
+def _make_viewer(watch: str, run: _OpenRun) -> "AbstractContextManager[ViewerCallback | None]":
+    """Return the callback that records the run for the viewer; a context manager of None for "off"."""
     if watch == "off":
         return nullcontext()
     from cprl.viewer.callback import ViewerCallback
 
     live = None if watch == "file" else watch
-    exhibition = None if live is None else exhibited(experiment, env, population)
-    return ViewerCallback.of(experiment, directory, env, live=live, exhibited=exhibition)
+    exhibit = None if live is None else partial(experimental("exhibition"), run.experiment, run.population)
+    return ViewerCallback.of(run.experiment, run.directory, run.env, live=live, exhibit=exhibit)
 
 
-def _say_what_is_kept(experiment: Experiment, directory: Path) -> None:
-    for checkpoint in checkpoints_in(directory / FOLDER):
-        size = checkpoint.stat().st_size / 1e6
-        text = f"Kept to extend it by --resume with more {experiment.length.flag}: {FOLDER}/ending-*.pt"
-        console().print(f"{text}, {size:,.0f} MB", style="dim", highlight=False, soft_wrap=True)
+def _say_kept_state(run: _OpenRun) -> None:
+    """Print how to extend the run, if it keeps the state of its training."""
+    for ending in endings_of(run.directory):
+        size_mb = ending.stat().st_size / 1e6
+        text = (
+            f"Kept to extend it by --resume with more {run.experiment.length.flag}: {CHECKPOINTS}/ending-*.pt"
+        )
+        console().print(f"{text}, {size_mb:,.0f} MB", style="dim", highlight=False, soft_wrap=True)

@@ -1,8 +1,9 @@
-"""Agents that earlier runs learned, read by `load`, and how they play."""
+"""Stored agents of earlier runs, read by `load`, and their policies."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -14,88 +15,79 @@ from torchrl.envs import EnvBase
 
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
+from cprl.envs.env_state import load_transforms_state
 from cprl.envs.make_env import make_env, spaces_of
-from cprl.envs.state import load_transforms_state
 from cprl.experiment import Experiment
-from cprl.networks.agent import acting_part
+from cprl.networks.agent import acting_network
 from cprl.networks.finite import all_finite
 from cprl.networks.recurrent import state_cells_of
 from cprl.networks.stacked import stack_lanes
-from cprl.policies.assignment import AgentIndices, AgentPolicies
-from cprl.policies.decisions import (
-    ballot_sizes,
-    stored_decisions,
-)
-from cprl.policies.lanes import LaneActor
+from cprl.policies.actors import LaneActor
+from cprl.policies.decisions import ballot_sizes, stored_decisions
+from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
-from cprl.population import (
-    AgentSpec,
-    Frozen,
-    Learning,
-    Scripted,
-    Team,
-    specs_by_agent,
-)
-from cprl.runs.checkpoints import FOLDER
+from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, specs_by_agent
+from cprl.runs.checkpoints import CHECKPOINTS
 from cprl.runs.episodes import read_episodes
-from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, say_changes
-from cprl.runs.weights import weights_in, weights_of
-from cprl.values import Custom, made, shown
+from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, warn_of_changes
+from cprl.runs.weights import frozen_weights_name, weights_in
+from cprl.values import Custom, instantiate, short_repr
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StoredAgent:
-    """An agent that does not learn any more: how it acts, and its network if it has one."""
+    """An agent that no longer learns: a scripted policy, or a network and how it acts by it."""
 
     scripted: ScriptedPolicy | None = None
     """The policy that it follows; None for an agent that acts by a network."""
     network: nn.Module | None = field(default=None, repr=False)
     stochastic: bool = False
-    """Whether the network outputs the logits of a policy; else it outputs action values."""
+    """True if the network outputs the logits of a policy; else it outputs action values."""
     epsilon: float = 0.0
     """The probability of a random action in evaluation."""
     algorithm: str = field(default="", repr=False)
-    """What it learned by."""
+    """The algorithm that it learned by, as text."""
     decisions: Tensor | None = field(default=None, repr=False)
-    """The values of its choices on all ballots, float64 [C]; None if it decides by chance, or nothing."""
+    """The values of its choices on all ballots, float64 [C]; None if it decides at random, or has no
+    ballots."""
 
     @property
     def kind(self) -> tuple[Any, ...]:
-        """What agents have in common that can be lanes of one actor."""
+        """Return the kind of the agent; agents of one kind can be lanes of one actor."""
         return self.scripted, self.stochastic, self.epsilon, self.algorithm
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LoadedRun:
-    """A run, built again from its directory alone; see `load`."""
+    """A run, loaded from its directory alone; see `load`."""
 
     path: Path
     experiment: Experiment
     recipe: Mapping[str, Any]
-    """What `recipe.json` holds."""
+    """The content of `recipe.json`."""
     networks: Mapping[str, nn.Module]
     """The trained acting network of each lane, by "replica_0/agent_0" and so on."""
     weights_from: Path
-    """The file that held them: of a run that has not ended, its newest checkpoint."""
+    """The file of the weights: for a run that has not ended, its newest checkpoint."""
     transforms_state: Mapping[str, Any]
-    """What the transforms of the environment had learned."""
+    """The states of the environment's transforms."""
     decisions: Mapping[str, Tensor] = field(default_factory=dict)
-    """The values of what each lane decides, see `cprl.policies.decisions`; empty where it decides nothing."""
+    """The values of each lane's decisions, see `cprl.policies.decisions`; empty without ballots."""
     _earlier: dict[str, "LoadedRun"] = field(default_factory=dict, repr=False)
-    """Runs whose agents are frozen in this one, read once."""
+    """Other runs whose agents are frozen in this one, read once."""
 
     def __repr__(self) -> str:
         return f"LoadedRun({str(self.path)!r}, {self.experiment!r})"
 
     @cached_property
     def game(self) -> Any:
-        """What was played."""
-        return made(self.experiment.game)
+        """Return the game that was played."""
+        return instantiate(self.experiment.game)
 
     @property
     def metrics(self) -> tuple[Custom, ...]:
-        """The user's own."""
+        """Return the custom metrics of the experiment."""
         return self.experiment.metrics
 
     @property
@@ -104,22 +96,22 @@ class LoadedRun:
 
     @cached_property
     def spaces(self) -> Spaces:
-        """What its agents observe and may do, transforms included."""
+        """Return the observations and actions of its agents, transforms included."""
         return spaces_of(self.env())
 
     @property
     def playing(self) -> Game | Spaces:
-        """What policies are made for: the game, or its spaces alone where it is none of cprl's."""
+        """Return what policies are made for: the game, or its spaces if it is not a game of cprl."""
         return self.game if isinstance(self.game, Game) else self.spaces
 
     @property
     def replicas(self) -> list[int]:
-        """The numbers of its replicas."""
+        """Return the numbers of its replicas."""
         numbers = sorted({int(lane.split("/")[0].removeprefix("replica_")) for lane in self.networks})
         return numbers or list(range(self.experiment.replicas))
 
     def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase:
-        """So many fresh worlds of the run's game, with its transforms as they were at the end."""
+        """Return fresh worlds of the run's game, with its transforms as they were at the end."""
         env = make_env(
             self.game,
             worlds=worlds,
@@ -131,7 +123,7 @@ class LoadedRun:
         return env
 
     def agent(self, agent: int, *, replica: int = 0) -> StoredAgent:
-        """An agent of a replica."""
+        """Return an agent of a replica."""
         if not 0 <= agent < self.game.agents:
             raise ValueError(f"agent is {agent}; {self.path} has the agents 0 to {self.game.agents - 1}")
         spec = self.specs[agent]
@@ -139,7 +131,7 @@ class LoadedRun:
             return StoredAgent(scripted=spec.policy)
         if isinstance(spec, Frozen):
             if spec.run not in self._earlier:
-                weights = weights_of(self.recipe, self.path, spec.run)
+                weights = frozen_weights_name(self.recipe, self.path, spec.run)
                 self._earlier[spec.run] = load(spec.run, weights=weights)
             return self._earlier[spec.run].agent(spec.agent, replica=spec.replica_for(replica))
         lane = lane_name(replica, agent)
@@ -158,44 +150,43 @@ class LoadedRun:
             return None
         if not isinstance(values, Tensor) or values.shape != (sum(sizes),) or values.isnan().any():
             raise ValueError(
-                f"{self.path} keeps {shown(values)} of what {lane} decides; allowed: {sum(sizes)} values"
+                f"{self.path} keeps {short_repr(values)} of what {lane} decides; allowed: {sum(sizes)} values"
             )
         return values
 
-    def policy(self, replica: int = 0, *, worlds: int = 1, seed: int = 0) -> AgentPolicies:
-        """The agents of a replica in so many worlds side by side; those that learned explore as in evaluation
-        where asked to, by random numbers that follow from the seed.
-        """
+    def policy(self, replica: int = 0, *, worlds: int = 1, seed: int = 0) -> JointPolicy:
+        """Return the policies of a replica's agents for several worlds; trained agents explore as in
+        evaluation if asked to, with random numbers from the seed."""
         agents = [[self.agent(agent, replica=replica)] for agent in range(self.game.agents)]
         return stored_policies(agents, self.playing, replicas=[replica], worlds=worlds, seed=seed)
 
     def episodes(self) -> pa.Table:
-        """The table of episodes; see `cprl.runs.episodes.read_episodes`."""
+        """Return the table of episodes; see `cprl.runs.episodes.read_episodes`."""
         return read_episodes(self.path)
 
 
 def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
-    """Builds a run again from its directory; runs no code that it holds.
+    """Load a run from its directory, without running code that it holds.
 
-    Warns on standard error where the user's own code is no longer what the run was made with.
+    Warn on standard error if user code has changed since the run was made.
 
-    Files outside the directory are read for `Frozen` agents alone: the recipe names their runs by paths,
-    which may lead anywhere, e.g. "../other". They are read when such an agent is asked for, without code.
+    Files outside the directory are read for `Frozen` agents only: the recipe names their runs by paths, which
+    may lead anywhere, e.g. "../other". They are read, without running code, when such an agent is needed.
 
     Args:
-        weights: which of those in its `checkpoints/`: "final", "best" where the recipe keeps them, or
-            "final-4800" of a run that was extended from so many episodes; by default the final ones, or those
-            of the newest readable checkpoint where the run has not ended.
+        weights: the name of weights in its `checkpoints/`: "final", "best" if the recipe keeps them, or
+            "final-4800" for a run that was extended from 4800 episodes; by default the final ones, or those
+            of the newest readable checkpoint if the run has not ended.
     """
     run = Path(run)
     if weights is not None and (Path(weights).name != weights or weights in ("", "..")):
-        raise ValueError(f'weights is {weights!r}; allowed: a name in {run / FOLDER}, such as "final"')
+        raise ValueError(f'weights is {weights!r}; allowed: a name in {run / CHECKPOINTS}, such as "final"')
     recipe = read_recipe(run)
     try:
         experiment = Experiment.from_recipe(recipe, directory=run)
     except ValueError as error:
         raise ValueError(f"{run / RECIPE_FILE}: {error}") from error
-    say_changes(run, [f"the text of {module}, which its recipe keeps" for module in changed_code(recipe)])
+    warn_of_changes(run, [f"the text of {module}, which its recipe keeps" for module in changed_code(recipe)])
     kept_weights = weights_in(run, weights)
     networks: dict[str, nn.Module] = {}
     loaded = LoadedRun(
@@ -207,7 +198,7 @@ def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
         transforms_state=kept_weights.transforms,
         decisions=kept_weights.decisions,
     )
-    with torch.random.fork_rng(devices=[]):  # networks draw weights at first, which the stored ones replace
+    with torch.random.fork_rng(devices=[]):  # new networks draw initial weights, which are replaced
         networks |= _networks(loaded, kept_weights.networks)
     return loaded
 
@@ -222,7 +213,7 @@ def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module
             if not isinstance(spec, Learning | Team):
                 raise ValueError(f"{lane} is the network of an agent that does not learn")
             refusal = f"{run.path / RECIPE_FILE}: a network cannot be made"
-            networks[lane] = acting_part(made(spec.algorithm).make_network(run.spaces))
+            networks[lane] = acting_network(instantiate(spec.algorithm).make_network(run.spaces))
             refusal = no_weights
             networks[lane].load_state_dict(state)
     except Exception as error:
@@ -235,18 +226,22 @@ def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module
 
 
 def trained_agent(spec: Learning | Team, network: nn.Module, decisions: Tensor | None) -> StoredAgent:
-    algorithm = made(spec.algorithm)
+    """Return an agent that has learned, with its network and the values of its decisions."""
+    algorithm = instantiate(spec.algorithm)
+    epsilon = 0.0
+    if not algorithm.stochastic:
+        epsilon = getattr(algorithm.settings, "epsilon_evaluation", 0.0)
     return StoredAgent(
         network=network,
         stochastic=algorithm.stochastic,
-        epsilon=0.0 if algorithm.stochastic else getattr(algorithm.settings, "epsilon_evaluation", 0.0),
+        epsilon=epsilon,
         algorithm=repr(spec.algorithm),
         decisions=decisions,
     )
 
 
-def in_a_row(replicas: Sequence[int]) -> list[list[int]]:
-    """Ascending numbers in groups without gaps, as the worlds of an environment are."""
+def consecutive_groups(replicas: Sequence[int]) -> list[list[int]]:
+    """Return ascending numbers in groups without gaps, since the worlds of an environment have none."""
     breaks = np.flatnonzero(np.diff(replicas) > 1) + 1
     return [numbers.tolist() for numbers in np.split(np.array(replicas), breaks)]
 
@@ -258,31 +253,32 @@ def stored_policies(
     replicas: Sequence[int],
     worlds: int,
     seed: int,
-) -> AgentPolicies:
-    """Stored agents as the policies of all agents of some replicas, agents of one kind as lanes of one actor.
+) -> JointPolicy:
+    """Return the policies of stored agents of some replicas; agents of one kind are lanes of one actor.
 
     Args:
-        agents: by agent and replica.
-        seed: what random numbers follow from, with the replica and the agent.
+        agents: the stored agents, by agent and replica.
+        seed: the seed of random numbers, with the replica and the agent.
     """
     by_index = dict(enumerate(agents))
-    kinds = {agent: of_replicas[0].kind for agent, of_replicas in by_index.items()}
+    kinds = {agent: stored[0].kind for agent, stored in by_index.items()}
     seeds = partial(lane_seeds, seed, replicas=replicas, purpose=Purpose.EVALUATION)
     decisions = None
     if isinstance(playing, Game):
         stored = decision_values(by_index)
         decisions = stored_decisions(playing, stored, replicas=replicas, worlds=worlds, seed=seed)
     actors = stored_actors(by_index, playing, kinds=kinds, seeds=seeds, worlds=worlds, stacks=True)
-    return AgentPolicies(actors, decisions=decisions)
+    return JointPolicy(actors, decisions=decisions)
 
 
 def decision_values(agents: Mapping[int, Sequence[StoredAgent]]) -> dict[int, list[Tensor]]:
-    """The values of the decisions of each replica, of agents that have any; scripted ones have none."""
-    values = {
-        agent: [stored.decisions for stored in of_replicas if stored.decisions is not None]
-        for agent, of_replicas in agents.items()
-    }
-    return {agent: of_replicas for agent, of_replicas in values.items() if of_replicas}
+    """Return the values of the decisions of agents that have any, in each replica."""
+    values = {}
+    for agent, replicas in agents.items():
+        decisions = [stored.decisions for stored in replicas if stored.decisions is not None]
+        if decisions:
+            values[agent] = decisions
+    return values
 
 
 def stored_actors(
@@ -293,23 +289,24 @@ def stored_actors(
     seeds: Callable[..., Sequence[Sequence[int]]],
     worlds: int,
     stacks: bool = False,
-) -> dict[AgentIndices, nn.Module]:
-    """Actors for stored agents, those of a kind as lanes of one: lane = replica x agents + agent.
+) -> dict[ActorAgents, nn.Module]:
+    """Return actors for stored agents; agents of one kind are lanes of one actor: lane = replica x agents +
+    agent.
 
     Args:
-        agents: of each replica, by index.
-        seeds: those of the lanes of some `agents`.
-        stacks: whether lanes of one and the same network are stacked too, so that its values are, to the last
-            bit, those that it has among others.
+        agents: the stored agents of each replica, by index.
+        seeds: returns the seeds of the lanes of some `agents`.
+        stacks: whether lanes with the very same network are stacked too, so that its values equal, to the
+        last bit,
+            those beside other networks.
     """
     alike: dict[Any, list[int]] = {}
     for agent in sorted(agents):
         alike.setdefault(kinds[agent], []).append(agent)
     spaces = playing.spaces if isinstance(playing, Game) else playing
-    actors: dict[AgentIndices, nn.Module] = {}
+    actors: dict[ActorAgents, nn.Module] = {}
     for together in alike.values():
-        of_replicas = zip(*(agents[agent] for agent in together), strict=True)
-        lanes = [lane for of_replica in of_replicas for lane in of_replica]
+        lanes = list(chain.from_iterable(zip(*map(agents.get, together), strict=True)))
         first = lanes[0]
         common: dict[str, Any] = {"seeds": seeds(agents=together), "agents": len(together), "worlds": worlds}
         if first.scripted is not None:
@@ -317,7 +314,7 @@ def stored_actors(
             continue
         networks: list[Any] = [lane.network for lane in lanes]
         actor = LaneActor(
-            _side_by_side(networks, stacks=stacks),
+            _apply_together(networks, stacks=stacks),
             spaces.actions,
             stochastic=first.stochastic,
             state_cells=state_cells_of(networks[0]),
@@ -328,15 +325,15 @@ def stored_actors(
     return actors
 
 
-def _side_by_side(networks: Sequence[nn.Module], *, stacks: bool) -> Callable[..., Any]:
-    """What all networks give for what their lanes see, [L, k, ...] to [L, k, A]; of recurrent ones also their
-    states."""
+def _apply_together(networks: Sequence[nn.Module], *, stacks: bool) -> Callable[..., Any]:
+    """Return a function that applies each network to the observations of its lane, [L, k, ...] to [L, k, A];
+    recurrent networks also return their states."""
     first = networks[0]
     if not stacks and all(network is first for network in networks):
         first.requires_grad_(False)
         return lambda *seen: first(*seen)
     try:
         stack = stack_lanes(networks)
-    except ValueError:  # of a form that does not stack, e.g. a network of the user's own
+    except ValueError:  # these networks do not stack, e.g. custom ones
         return lambda seen: torch.stack([network(lane) for network, lane in zip(networks, seen, strict=True)])
     return lambda *seen: stack(*seen)

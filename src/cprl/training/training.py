@@ -1,4 +1,4 @@
-"""train: a training from its first step to its last."""
+"""Training: the loop from the first step to the last; train, and what callbacks get."""
 
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,33 +15,33 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import keys, recurrent_state
+from cprl.envs.env_state import env_state, load_env_state
 from cprl.envs.make_env import check_env, spaces_of
-from cprl.envs.state import carried_state, env_state, load_carried, load_env_state
 from cprl.envs.unwrap import commons_of
 from cprl.keys import Turn
-from cprl.learners.base import AnyLearner
-from cprl.measuring.episodes import Episode, tracker_of
+from cprl.learners.protocol import AnyLearner
 from cprl.measuring.series import Observer
-from cprl.policies.assignment import AgentIndices, AgentPolicies
+from cprl.measuring.tracker import Episode, tracker_of
 from cprl.policies.decisions import Decider
+from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.files import TRAINING_STATE_FORMAT
 from cprl.runs.schedule import Schedule
 from cprl.system.times import Times
-from cprl.training.finite import EVERY_TURNS, FiniteCheck
 from cprl.training.learning import (
     LaneLosses,
-    WantedReturns,
+    ShapedReturns,
     check_agents,
     check_decisions,
-    learned_in,
+    learning_numbers,
 )
-from cprl.values import Custom, checked, shown
-from cprl.values.arrays import Float64
+from cprl.training.nan_check import EVERY_TURNS, FiniteCheck
+from cprl.values import Custom, checked, short_repr
+from cprl.values.array_types import Float64
 
 
 class StepCollector(BaseCollector):
-    """Yields steps of all worlds one by one, batch size [B].
+    """A collector that yields steps of all worlds one by one, batch size [B].
 
     Equivalent to `Collector(env, policy, frames_per_batch=B)` without its time axis of length 1, as a test
     checks, and several times faster. It does not stack, copy or track anything: batches contain the
@@ -53,7 +53,8 @@ class StepCollector(BaseCollector):
 
     def __init__(self, env: EnvBase, policy: nn.Module) -> None:
         super().__init__()
-        self.env, self.policy = env, policy
+        self.env = env
+        self.policy = policy
         self.frames_per_batch = env.batch_size.numel()
         self.carried: TensorDictBase | None = None
         """The input of the environment's next step; None before the first step."""
@@ -85,25 +86,29 @@ class StepCollector(BaseCollector):
 
 
 MakeCollector = Callable[[EnvBase, nn.Module], BaseCollector]
-"""A collector out of an environment and a policy; it yields batches [B], or [B, T] of T turns."""
+"""A function from an environment and a policy to a collector, which yields batches [B], or [B, T] of T
+turns."""
 
 
 class Training:
-    """A training that takes one turn after the other, and whose whole state can be read and set.
+    """The training loop of all replicas, with a state that can be saved and restored at any turn.
 
-    All replicas take each turn together. A replica whose episodes are short plays on until the last one has
-    played its last episode; callbacks get no episodes beyond those of the schedule. Episodes of a replica are
-    counted in the order of the turns in which they end, and within a turn in that of its worlds.
+    All replicas take each turn together. A replica with short episodes plays on until every replica has
+    reached the length of the schedule; callbacks do not get its additional episodes. Episodes of a replica
+    are counted in the order in which they end, those of one turn by world.
 
     Args:
         env: W worlds of each replica R; world b belongs to replica b // W.
-        learners: by the indices of their agents, a tuple; each updates these agents in every replica.
-        schedule: how long each replica is trained, in how many worlds, and when its learners update.
-        others: the actors of the agents that do not learn, likewise; an actor of one agent by its index.
-        decisions: what all agents decide, and learn to, where the game asks them; see `Game.decisions`.
+        learners: the learners by the indices of their agents, a tuple; each updates these agents in every
+            replica.
+        schedule: the length of the training, the worlds of each replica, and the turns between updates.
+        others: the actors of the agents that do not learn, by their indices; an actor of one agent by its
+            index.
+        decisions: the decisions of all agents on the game's ballots, and how they learn them; see
+            `Game.decisions`.
         callbacks: called after each turn and each episode, in this order; see `Callback`.
-        metrics: the user's own, see `cprl.measuring.EpisodeTracker`.
-        make_collector: what plays; one of TorchRL's own is several times slower, and cannot be resumed.
+        metrics: custom metrics, see `cprl.measuring.EpisodeTracker`.
+        make_collector: makes the collector; those of TorchRL are several times slower, and cannot be resumed.
     """
 
     def __init__(
@@ -112,7 +117,7 @@ class Training:
         learners: Mapping[tuple[int, ...], AnyLearner],
         schedule: Schedule,
         *,
-        others: Mapping[AgentIndices, nn.Module] | None = None,
+        others: Mapping[ActorAgents, nn.Module] | None = None,
         decisions: Decider | None = None,
         callbacks: Sequence[Any] = (),
         metrics: Sequence[Custom] = (),
@@ -131,64 +136,69 @@ class Training:
         for learner in self.learners.values():
             schedule.refuse_rollouts(getattr(learner.settings, "rollout_steps", schedule.update_every))
         commons = commons_of(env)
-        check_decisions(decisions, 0 if commons is None else commons.game.decisions)
-        actors: dict[AgentIndices, nn.Module] = {
+        options = 0 if commons is None else commons.game.decisions
+        check_decisions(decisions, options)
+        actors: dict[ActorAgents, nn.Module] = {
             agents: learner.actor for agents, learner in self.learners.items()
         }
-        self._collector = make_collector(env, AgentPolicies({**actors, **self.others}, decisions=decisions))
+        self._collector = make_collector(env, JointPolicy({**actors, **self.others}, decisions=decisions))
         self._batches = iter(self._collector)
         self._tracker = tracker_of(env, metrics)
         self._losses = {agents: LaneLosses(self.replicas, agents) for agents in self.learners}
-        self._wanted = WantedReturns(env.batch_size.numel(), spaces.agents, self.learners)
+        self._shaped_returns = ShapedReturns(env.batch_size.numel(), spaces.agents, self.learners)
         for learner in self.learners.values():
             learner.begin()
         self.finite = FiniteCheck(self.learners, spaces, worlds=schedule.worlds, on_nan=schedule.on_nan)
         self.observer = Observer(callbacks, env, worlds=schedule.worlds)
-        """What calls the callbacks."""
-        self._played = [0] * self.replicas
+        """The caller of the callbacks."""
+        self._ended_episodes = [0] * self.replicas
+        """The episodes that each replica has ended, also those beyond the training's length."""
         self.steps = 0
         """Steps of each replica so far."""
         self.times = Times()
+        """The seconds spent on acting, storing and updating, and on compiling."""
 
     def __repr__(self) -> str:
         return f"Training({self.env!r}, {self.steps} steps of {self.schedule.length})"
 
     @property
     def is_over(self) -> bool:
-        return self.schedule.is_over(self._played, self.steps)
+        return self.schedule.is_over(self._ended_episodes, self.steps)
 
     @property
     def is_ending(self) -> bool:
-        """Whether a replica may play its last episode in the next turn, see `Schedule.is_ending`."""
-        return self.schedule.is_ending(self._played, self.steps)
+        """Return whether a replica may play its last episode in the next turn, see `Schedule.is_ending`."""
+        return self.schedule.is_ending(self._ended_episodes, self.steps)
 
     @property
-    def is_sound(self) -> bool:
-        """Whether everything was finite so far; with `on_nan` "stop" a training that goes on always is."""
+    def is_finite(self) -> bool:
+        """Return whether everything was finite so far; always true while a training with `on_nan` "stop"
+        runs."""
         return not self.finite.reported
 
     @property
     def episodes_played(self) -> int:
-        """Episodes that all replicas together have ended so far, those beyond its length left out."""
+        """Return the episodes that all replicas together have ended, without those beyond the training's
+        length."""
         return sum(self.episodes_by_replica)
 
     @property
     def episodes_by_replica(self) -> list[int]:
-        """Likewise, of each replica."""
-        return [self.schedule.counted(played) for played in self._played]
+        """Return the episodes that each replica has ended, without those beyond the training's length."""
+        return [self.schedule.counted(played) for played in self._ended_episodes]
 
     @property
     def callbacks(self) -> list[Any]:
         return self.observer.callbacks
 
     def start(self) -> None:
-        """Calls `on_start` of the callbacks; `run` does before the first step."""
+        """Call `on_start` of the callbacks; `run` does before the first step."""
         self.observer.on_start(self)
 
     def run(self, checkpointer: Checkpointer | None = None) -> None:
-        """Takes all steps, from the newest checkpoint on if there is one."""
+        """Take all steps, from the newest checkpoint on if there is one."""
         if checkpointer is not None:
-            self.state_dict()  # what cannot be saved is refused now, not when the first checkpoint is due
+            self.state_dict()  # refuse what cannot be saved now, not at the first checkpoint
             checkpointer.restore(self)
         self.start()
         while not self.is_over:
@@ -197,42 +207,42 @@ class Training:
                 checkpointer.after_step(self)
 
     def step(self) -> None:
-        """The turns that the collector yields, one as a rule: act, store, update, measure, record."""
-        for batch in self._act():
+        """Take the next turns, usually one: act, store, update, measure, record."""
+        for batch in self._next_turns():
             turn = Turn.of(batch)
             self.steps += self.schedule.worlds
             turns = self.steps // self.schedule.worlds
             with self.times:
-                self._store(turn)
+                self._store_turn(turn)
                 if turns % self.schedule.update_every == 0:
                     for _ in range(self.schedule.update_every):
-                        self._update()
+                        self._update_learners()
             self.observer.on_step(batch)
             ended = self._tracker.add(turn)
             if ended:
                 self._check_finite(ended, weights=True)
-                learned = self._end(ended, turn)
-                self._record(ended, learned)
+                learning = self._end_episodes(ended, turn)
+                self._record_episodes(ended, learning)
             elif turns % EVERY_TURNS == 0:
                 self._check_finite()
 
-    def _act(self) -> Sequence[TensorDictBase]:
-        """The next turns of every world, one as a rule, [B] each."""
+    def _next_turns(self) -> Sequence[TensorDictBase]:
+        """Return the next turns of every world, usually one, [B] each."""
         with self.times:
             batch = next(self._batches)
         return [batch] if batch.batch_dims == 1 else batch.unbind(1)
 
-    def _store(self, turn: Turn) -> None:
+    def _store_turn(self, turn: Turn) -> None:
         self.finite.add(turn)
         for learner in self.learners.values():
             learner.store(turn)
-        self._wanted.add()
+        self._shaped_returns.add()
 
-    def _update(self) -> None:
+    def _update_learners(self) -> None:
         for agents, learner in self.learners.items():
             try:
                 loss = learner.update()
-            except (RuntimeError, ValueError):  # some losses refuse NaN in words of their own
+            except (RuntimeError, ValueError):  # some losses raise errors of their own for NaN
                 self._check_finite(weights=True)
                 raise
             self._losses[agents].add(loss)
@@ -243,39 +253,40 @@ class Training:
             returns[episode.world] = episode.return_
         self.finite.check(self._losses, returns, self.steps, weights=weights)
 
-    def _end(self, ended: Sequence[Episode], turn: Turn) -> list[dict[str, float]]:
-        """Ends episodes of the learners; returns what was learned in each."""
+    def _end_episodes(self, ended: Sequence[Episode], turn: Turn) -> list[dict[str, float]]:
+        """End episodes of the learners; return the numbers of learning of each."""
         worlds = [episode.world for episode in ended]
-        learned = learned_in(worlds, turn, self.learners, self._losses, self.schedule.worlds)
+        learned = learning_numbers(worlds, turn, self.learners, self._losses, self.schedule.worlds)
         has_ended = torch.zeros(self.env.batch_size, dtype=torch.bool)
         has_ended[worlds] = True
         for learner in self.learners.values():
             learner.end_episode(has_ended)
         return learned
 
-    def _record(self, ended: Sequence[Episode], learned: Sequence[dict[str, float]]) -> None:
-        """Counts episodes that have ended, and hands those of the schedule to the callbacks."""
+    def _record_episodes(self, ended: Sequence[Episode], learned: Sequence[dict[str, float]]) -> None:
+        """Count episodes that have ended, and hand those within the schedule to the callbacks."""
         recorded: list[tuple[Episode, dict[str, float]]] = []
-        for episode, of_agents in zip(ended, learned, strict=True):
+        for episode, numbers in zip(ended, learned, strict=True):
             replica = episode.world // self.schedule.worlds
-            wanted = self._wanted.take(episode.world)
-            number = self._played[replica]
-            episode = replace(episode, replica=replica, episode=number, wanted_return=wanted)
+            shaped = self._shaped_returns.take(episode.world)
+            number = self._ended_episodes[replica]
+            episode = replace(episode, replica=replica, episode=number, wanted_return=shaped)
             if self.decisions is not None and episode.decision is not None:
-                returns = np.where(np.isnan(wanted), episode.return_, wanted)
+                returns = np.where(np.isnan(shaped), episode.return_, shaped)
                 self.decisions.learn(replica, episode.decision, returns)
-            self._played[replica] += 1
+            self._ended_episodes[replica] += 1
             if self.schedule.counted(number + 1) > number:
-                recorded.append((episode, of_agents))
+                recorded.append((episode, numbers))
         if recorded:
             self.observer.on_ended(recorded)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that the future depends on, in tensors, numbers, lists and dicts; not copies.
+        """Return everything that the future of the training depends on, as tensors, numbers, lists and dicts,
+        uncopied.
 
         Raises:
-            ValueError: where the collector has no state to resume from.
-            NotFiniteError: where weights are not finite, unless `on_nan` is "continue".
+            ValueError: if the collector has no state to resume from.
+            NotFiniteError: if weights are not finite, unless `on_nan` is "continue".
         """
         carried = self._step_collector().carried
         self._check_finite(weights=True)
@@ -283,38 +294,43 @@ class Training:
         return {
             "format": TRAINING_STATE_FORMAT,
             "steps": self.steps,
-            "played": list(self._played),
+            "played": list(self._ended_episodes),
             "env": env_state(self.env),
-            "carried": None if carried is None else carried_state(carried),
-            "callbacks": {name: callback.state_dict() for name, callback in self._with_state().items()},
+            "carried": None if carried is None else carried.to_dict(),
+            "callbacks": {
+                name: callback.state_dict() for name, callback in self._stateful_callbacks().items()
+            },
             "torch": torch.get_rng_state(),
-            **{name: [dict(part.state_dict()) for part in parts] for name, parts in self._parts().items()},
+            **{name: _states(parts) for name, parts in self._stateful_parts().items()},
         }
 
-    def _parts(self) -> dict[str, list[Any]]:
-        """What has a state of its own, by its name in a state of the training."""
+    def _stateful_parts(self) -> dict[str, list[Any]]:
+        """Return the parts that have a state, by their names in the state of the training."""
         return {
             "learners": list(self.learners.values()),
             "others": list(self.others.values()),
             "decisions": [] if self.decisions is None else [self.decisions],
             "losses": list(self._losses.values()),
-            "wanted": [self._wanted],
+            "wanted": [self._shaped_returns],
             "tracker": [self._tracker],
             "observer": [self.observer],
             "finite": [self.finite],
             "times": [self.times],
         }
 
-    def _with_state(self) -> dict[str, Any]:
-        """The callbacks that have a state, by the name of their class; a second one of a class gets a 2."""
-        named: dict[str, Any] = {}
-        of_kind: Counter[str] = Counter()
+    def _stateful_callbacks(self) -> dict[str, Any]:
+        """Return the callbacks that have a state, by the name of their class; a second one of a class gets a
+        2."""
+        callbacks: dict[str, Any] = {}
+        counts: Counter[str] = Counter()
         for callback in self.callbacks:
             if hasattr(callback, "state_dict") and hasattr(callback, "load_state_dict"):
-                kind = type(callback).__name__
-                of_kind[kind] += 1
-                named[kind if of_kind[kind] == 1 else f"{kind} {of_kind[kind]}"] = callback
-        return named
+                name = type(callback).__name__
+                counts[name] += 1
+                if counts[name] > 1:
+                    name = f"{name} {counts[name]}"
+                callbacks[name] = callback
+        return callbacks
 
     def _step_collector(self) -> StepCollector:
         if not isinstance(self._collector, StepCollector):
@@ -325,27 +341,31 @@ class Training:
         return self._collector
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Resumes exactly where the training of that state was, which was made with the same arguments."""
-        form = state.get("format", 1)
-        if form != TRAINING_STATE_FORMAT:
+        """Resume exactly from the state of a training that was made with the same arguments."""
+        format_number = state.get("format", 1)
+        if format_number != TRAINING_STATE_FORMAT:
             raise ValueError(
-                f"the state has the format {form}, this version resumes "
+                f"the state has the format {format_number}, this version resumes "
                 f"{TRAINING_STATE_FORMAT}; finish the run with the version that began it, whose commit is in "
                 "its recipe.json"
             )
         self.steps = int(state["steps"])
-        self._played = list(state["played"])
-        fresh = self.env.reset()  # the form of what is carried; the state then says where the worlds are
+        self._ended_episodes = list(state["played"])
+        template = self.env.reset()  # has the form of `carried`; the state of the worlds is loaded below
         load_env_state(self.env, state["env"])
         if state["carried"] is not None:
-            self._step_collector().carried = load_carried(fresh, state["carried"])
-        for name, parts in self._parts().items():
+            self._step_collector().carried = template.empty(recurse=True).update(state["carried"])
+        for name, parts in self._stateful_parts().items():
             for part, part_state in zip(parts, state[name], strict=True):
                 part.load_state_dict(part_state)
-        for name, callback in self._with_state().items():
-            if name in state["callbacks"]:  # a viewer may be added or left out from now on
+        for name, callback in self._stateful_callbacks().items():
+            if name in state["callbacks"]:  # a resumed training may have another viewer
                 callback.load_state_dict(state["callbacks"][name])
         torch.set_rng_state(state["torch"])
+
+
+def _states(parts: Sequence[Any]) -> list[dict[str, Any]]:
+    return [dict(part.state_dict()) for part in parts]
 
 
 def train(
@@ -353,25 +373,24 @@ def train(
     learners: Mapping[tuple[int, ...], AnyLearner],
     schedule: Schedule,
     *,
-    others: Mapping[AgentIndices, nn.Module] | None = None,
+    others: Mapping[ActorAgents, nn.Module] | None = None,
     decisions: Decider | None = None,
     callbacks: Sequence[Any] = (),
     metrics: Sequence[Custom] = (),
     make_collector: MakeCollector = StepCollector,
     checkpointer: Checkpointer | None = None,
 ) -> Training:
-    """Plays so many episodes, or takes so many steps, of every replica; each learner stores every turn and
-    then updates.
+    """Train learners for the length of a schedule: in each turn they act, store the turn and update.
 
     Args:
-        checkpointer: says where the training resumes from, and saves its state now and then. For the others
-            see `Training`.
+        checkpointer: restores the state of the training, and saves it now and then. For the others see
+            `Training`.
 
     Returns:
         The `Training`, which is over.
 
     Raises:
-        NotFiniteError: where a number is not finite, before a checkpoint holds it.
+        NotFiniteError: if a number is not finite, before a checkpoint holds it.
     """
     training = Training(
         env,
@@ -388,47 +407,50 @@ def train(
 
 
 class Callback(Protocol):
-    """What is called while a training runs; each method may be missing.
+    """The methods that a training calls, each of which may be missing.
 
     With `state_dict` and `load_state_dict` its state is part of the training's checkpoints.
     """
 
     def on_start(self, training: Any) -> None:
-        """The `Training` is about to take its first step, or the first after a checkpoint."""
+        """Prepare for a `Training` that takes its first step next, or the first after a checkpoint."""
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """One turn of every world, as the collector yields it, [B]."""
+        """Get a turn of every world, as the collector yields it, [B]."""
 
     def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
-        """Episodes of some replicas have ended in one turn: all of them, with what was learned in each,
-        before `on_episode` is called with one after the other."""
+        """Get all episodes that have ended in one turn, with their numbers of learning, before `on_episode`
+        gets each."""
 
     def on_episode(self, episode: Episode, learning: dict[str, float]) -> None:
-        """An episode has ended; what was learned in it: `agent_0/loss`, `agent_0/epsilon`, ...
+        """Get an episode that has ended, with its numbers of learning: `agent_0/loss`, `agent_0/epsilon`, ...
 
-        A number that is written into `learning` under a name of one's own is logged with the others, by the
-        loggers and the viewer of a run, and by callbacks that come later in a `Training`.
+        A number that is added to `learning` under a new name is logged like the others by loggers, the viewer
+        and later callbacks.
         """
 
     def on_numbers(self, episode: int, numbers: dict[str, Float64]) -> None:
-        """All replicas have ended an episode, counted from 0: its numbers by name, [R] of each replica, NaN
-        where undefined; of replicas in W worlds the last of W, whose means these are.
+        """Get the numbers of an episode, counted from 0, that all replicas have ended, [R] by name, NaN if
+        undefined.
 
-        Those of the whole training, `time/env_steps` and `time/env_steps_per_s`, are of length 1.
+        With W worlds these are means over W episodes, of which `episode` is the last.
+
+        Numbers of the whole training, `time/env_steps` and `time/env_steps_per_s`, have length 1.
         """
 
     def on_finished(self, run: Path) -> None:
-        """All of a run is written and said; by `cprl.run` alone, with the run's directory."""
+        """Get the directory of a finished run, after everything is written; only `cprl.run` calls it."""
 
 
-HOOKS: Final = ("on_start", "on_step", "on_ended", "on_episode", "on_numbers", "on_finished")
+HOOKS: Final = tuple(name for name in vars(Callback) if name.startswith("on_"))
+"""The names of the methods of a callback."""
 
 
 def check_callbacks(callbacks: Sequence[Any]) -> None:
-    """Refuses a callback that nothing would call."""
+    """Refuse a callback without any of the methods that a training calls."""
     for callback in callbacks:
         if not any(hasattr(callback, hook) for hook in HOOKS):
             raise ValueError(
-                f"the callback {shown(callback)} has none of the methods {', '.join(HOOKS)}: nothing would "
-                "call it"
+                f"the callback {short_repr(callback)} has none of the methods {', '.join(HOOKS)}: nothing "
+                "would call it"
             )

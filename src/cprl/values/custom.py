@@ -1,10 +1,10 @@
-"""Custom: something of the user's own, as a text that a run's recipe can keep; and what is allowed of it.
+"""Custom: user code as text that a run's recipe can keep, and which of it may be imported.
 
 A recipe that somebody else made names code that loading it would import. Such a recipe is refused unless this
 process trusts each name: `--allow module:Class` on the command line, `cprl.trust` in Python.
 
-What no module has, because it was defined in a script, a notebook or a function, is handed over live: the
-recipe says what it was called, and only the process that has it can use it.
+A class or function that no module has, because it was defined in a script, a notebook or a function, is
+handed over live: the recipe holds its name, and only the process that has the object can use it.
 """
 
 import importlib
@@ -21,31 +21,32 @@ from importlib.util import find_spec
 from types import FunctionType
 from typing import Any, Final
 
-_NAMES: Final = re.compile(r"[\w-]+(\.[\w-]+)*:\w+(\.\w+)*", re.ASCII)
-_LIVES: Final = re.compile(r"([0-9a-f]{8}-\d+)?", re.ASCII)
-_LIVE_NAMES: Final = re.compile(r"[\w.-]+:[\w.<>]+")
-"""Those of functions within functions have "<locals>"."""
+_NAME_PATTERN: Final = re.compile(r"[\w-]+(\.[\w-]+)*:\w+(\.\w+)*", re.ASCII)
+_LIVE_KEY_PATTERN: Final = re.compile(r"([0-9a-f]{8}-\d+)?", re.ASCII)
+_LIVE_NAME_PATTERN: Final = re.compile(r"[\w.-]+:[\w.<>]+")
+"""The names of live objects; those of nested functions contain "<locals>"."""
 _LONGEST_NAME: Final = 1000
 MOST_NESTED: Final = 64
 
 _LIVE: Final[dict[str, Any]] = {}
-"""The classes and functions that this process was handed live, by texts that no other process has."""
+"""The live classes and functions of this process, by keys that no other process has."""
 
 
 @dataclass(frozen=True)
 class Custom:
-    """A class or function of the user's own, by its name, with arguments that JSON can hold.
+    """A class or function of the user, named by its module, with arguments that JSON can hold.
 
-    An `Experiment` holds values only, so that its recipe says all of it: a transform, callback, logger,
-    network, algorithm or game that is not one of cprl's is handed over like this. Nothing is imported before
-    `make` is called; who loads a stored run says what it may import (`cprl.trust`).
+    An `Experiment` holds values only, so that its recipe describes it completely; a transform, callback,
+    logger, network, algorithm or game of your own is handed over as a `Custom`. Nothing is imported before
+    `make` is called, and a stored run may import only what you trust (`cprl.trust`).
 
     Args:
         target: "module:Class" or "module:function".
         arguments: its keyword arguments; strings, numbers, booleans, None, values of cprl, and lists and
             tables of them. A list of strings within a list becomes a tuple, so that nested TensorDict keys
             can be said: `{"in_keys": [["agents", "reward"]]}`.
-        live: which object of this process it is; "" for one that its name finds. See `custom_of`.
+        live: the key of an object of this process that no module has; "" for one that `target` imports. See
+            `custom_of`.
     """
 
     target: str
@@ -53,18 +54,18 @@ class Custom:
     live: str = ""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.live, str) or not _LIVES.fullmatch(self.live):
-            raise ValueError(f'Custom.live is {shown(self.live)}; allowed: "", or what `custom_of` says')
+        if not isinstance(self.live, str) or not _LIVE_KEY_PATTERN.fullmatch(self.live):
+            raise ValueError(f'Custom.live is {short_repr(self.live)}; allowed: "", or what `custom_of` says')
         is_text = isinstance(self.target, str) and len(self.target) <= _LONGEST_NAME
-        names = _LIVE_NAMES if self.live else _NAMES
+        names = _LIVE_NAME_PATTERN if self.live else _NAME_PATTERN
         if not is_text or not names.fullmatch(self.target):
-            raise ValueError(f'Custom.target is {shown(self.target)}; allowed: "module:Class"')
+            raise ValueError(f'Custom.target is {short_repr(self.target)}; allowed: "module:Class"')
         if not isinstance(self.arguments, Mapping):
-            came = shown(self.arguments)
-            raise ValueError(f"Custom.arguments is {came}; allowed: a table of keyword arguments")
+            given = short_repr(self.arguments)
+            raise ValueError(f"Custom.arguments is {given}; allowed: a table of keyword arguments")
         try:
             refuse_other_keys(self.arguments)
-            text = json.dumps(dict(self.arguments), allow_nan=False, default=_table_of)
+            text = json.dumps(dict(self.arguments), allow_nan=False, default=_to_json)
             object.__setattr__(self, "arguments", json.loads(text))
         except (TypeError, ValueError, RecursionError) as error:
             raise ValueError(
@@ -77,7 +78,7 @@ class Custom:
     def resolve(self) -> Any:
         """Import the target and return it."""
         if self.live:
-            refuse_live([{"kind": "Custom", "target": self.target, "live": self.live}], of_others=True)
+            refuse_live([{"kind": "Custom", "target": self.target, "live": self.live}], only_foreign=True)
             return _LIVE[self.live]
         module, _, name = self.target.partition(":")
         try:
@@ -92,33 +93,37 @@ class Custom:
         return target
 
     def make(self, *positional: Any) -> Any:
-        """Call the target with its arguments and return what it makes."""
+        """Call the target with its arguments and return the result."""
         target = self.resolve()
         try:
-            return target(*positional, **{name: _argument(value) for name, value in self.arguments.items()})
+            return target(
+                *positional, **{name: _to_argument(value) for name, value in self.arguments.items()}
+            )
         except TypeError as error:
             raise ValueError(f"Custom({self.target!r}) does not take its arguments: {error}") from error
 
 
 def custom_of(value: Any) -> Any:
     """Return a class, a function, or a `functools.partial` of one with keyword arguments, as a `Custom`: by
-    its name where a module has it, else live; one that is defined again is another one. Return anything
-    else as it is."""
+    its name if a module has it, else live. An object that is defined again is a different one. Return
+    anything else unchanged."""
     target = value.func if isinstance(value, partial) and not value.args else value
     if not isinstance(target, type | FunctionType) or target.__module__ == "builtins":
         return value
     name = f"{target.__module__}:{target.__qualname__}"
     arguments = value.keywords if isinstance(value, partial) else {}
-    if target.__module__ != "__main__" and _imported(name) is target:
+    if target.__module__ != "__main__" and _find_imported(name) is target:
         return Custom(name, arguments)
     lives = (live for live, known in _LIVE.items() if known is target)
-    live = next(lives, f"{secrets.token_hex(4)}-{len(_LIVE)}")  # by chance, unlike that of a forked process
+    live = next(
+        lives, f"{secrets.token_hex(4)}-{len(_LIVE)}"
+    )  # random, so that a forked process has other keys
     _LIVE[live] = target
     return Custom(name, arguments, live)
 
 
-def _imported(name: str) -> Any:
-    """Return what is called "module:name" in the modules that are imported; None where there is none."""
+def _find_imported(name: str) -> Any:
+    """Return the object "module:name" of the modules imported so far; None if there is none."""
     module, _, path = name.partition(":")
     target: Any = sys.modules.get(module)
     for part in path.split("."):
@@ -127,11 +132,11 @@ def _imported(name: str) -> Any:
 
 
 _TRUSTED: Final[set[str]] = set()
-"""The targets that this process trusts, besides those that its own program names."""
+"""The targets that this process may import for stored tables."""
 
 
 def trust(*targets: str) -> None:
-    """Trust code of somebody's own, "module:Class" each, from now on and in the whole process.
+    """Trust user code, each named "module:Class", for the rest of this process.
 
     Recipes, runs and studies that name it can then be read, and may import it.
     """
@@ -140,7 +145,7 @@ def trust(*targets: str) -> None:
 
 @contextmanager
 def trusting(targets: Iterable[str]) -> Iterator[None]:
-    """Trust code of somebody's own, "module:Class" each, only within a block: for tests."""
+    """Trust user code, each named "module:Class", within a block only, for tests."""
     before = set(_TRUSTED)
     _TRUSTED.update(targets)
     try:
@@ -154,13 +159,12 @@ def trusted() -> tuple[str, ...]:
     return tuple(sorted(_TRUSTED))
 
 
-OWN_METRICS: Final[dict[str, Mapping[str, str]]] = {}
-"""What metrics of the user's own are called: "title" and "unit" by name, as the recipe that this process read
-last says."""
+METRIC_WORDS: Final[dict[str, Mapping[str, str]]] = {}
+"""The "title" and "unit" of custom metrics by name, from the recipe that this process read last."""
 
 
-def words_of_metric(metric: Custom) -> dict[str, str]:
-    """Return "title" and "unit" of a metric of the user's own, as far as its function has such attributes.
+def metric_words(metric: Custom) -> dict[str, str]:
+    """Return the attributes "title" and "unit" of a custom metric, if its function has them.
 
     Raises:
         ValueError: if one is no text.
@@ -169,35 +173,35 @@ def words_of_metric(metric: Custom) -> dict[str, str]:
     words = {name: getattr(function, name) for name in ("title", "unit") if hasattr(function, name)}
     for name, word in words.items():
         if not isinstance(word, str):
-            raise ValueError(f"{metric.target}.{name} is {shown(word)}; allowed: a text")
+            raise ValueError(f"{metric.target}.{name} is {short_repr(word)}; allowed: a text")
     return words
 
 
 def custom_targets(table: object) -> list[str]:
-    """Return the targets of all `Custom` in a table that are imported by their names, sorted."""
-    return sorted({str(entry.get("target")) for entry in _tables_of_customs(table) if not entry.get("live")})
+    """Return the sorted targets of all `Custom` in a table that are imported by name."""
+    return sorted({str(entry.get("target")) for entry in _custom_tables(table) if not entry.get("live")})
 
 
 def live_targets(table: object) -> list[str]:
-    """Return what is called the targets of all `Custom` in a table that are live, sorted."""
-    entries = _tables_of_customs(table)
-    return sorted({_on_a_line(str(entry.get("target"))) for entry in entries if entry.get("live")})
+    """Return the sorted names of all live `Custom` in a table."""
+    entries = _custom_tables(table)
+    return sorted({_printable(str(entry.get("target"))) for entry in entries if entry.get("live")})
 
 
-def _on_a_line(text: str) -> str:
-    """A text of a stranger's as a message or a terminal can show it."""
+def _printable(text: str) -> str:
+    """Return an untrusted text with unprintable characters replaced."""
     return "".join(sign if sign.isprintable() else "?" for sign in text)
 
 
-def refuse_live(table: object, *, of_others: bool = False, where: str = "the experiment") -> None:
-    """Raise a ValueError, by their names, for what a table has of live classes and functions.
+def refuse_live(table: object, *, only_foreign: bool = False, where: str = "the experiment") -> None:
+    """Raise a ValueError that names the live classes and functions in a table.
 
     Args:
-        of_others: only for those that this process does not have.
-        where: what the table is called in messages.
+        only_foreign: whether live objects of this process are allowed.
+        where: the name of the table in messages.
     """
-    entries = [entry for entry in _tables_of_customs(table) if entry.get("live")]
-    refused = [entry for entry in entries if not (of_others and str(entry["live"]) in _LIVE)]
+    entries = [entry for entry in _custom_tables(table) if entry.get("live")]
+    refused = [entry for entry in entries if not (only_foreign and str(entry["live"]) in _LIVE)]
     if refused:
         raise ValueError(
             f"{where} has {', '.join(live_targets(refused))}, which only the process that it was handed to "
@@ -205,34 +209,34 @@ def refuse_live(table: object, *, of_others: bool = False, where: str = "the exp
         )
 
 
-def described(table: object) -> list[str]:
-    """Return in words what a table has of code of the user's own: "laws:RichPay (fee 2.0): The rich pay".
+def describe_customs(table: object) -> list[str]:
+    """Return a description of each piece of user code in a table: "laws:RichPay (fee 2.0): The rich pay".
 
-    The sentence is the first line of a docstring. Nothing is imported to be described: without its module
-    there is the name alone.
+    The sentence is the first line of its docstring. Nothing is imported for it: code whose module is not
+    imported yet is described by its name and arguments alone.
     """
-    entries = _tables_of_customs(table)
-    parts = ((entry["target"], entry.get("arguments", {}), entry.get("live", "")) for entry in entries)
-    customs = (Custom(*part) for part in parts)
-    return list(dict.fromkeys(map(_in_words, customs)))
+    entries = _custom_tables(table)
+    customs = [
+        Custom(entry["target"], entry.get("arguments", {}), entry.get("live", "")) for entry in entries
+    ]
+    return list(dict.fromkeys(map(_describe, customs)))
 
 
-def _in_words(custom: Custom) -> str:
-    arguments = ", ".join(f"{name} {shown(value)}" for name, value in custom.arguments.items())
+def _describe(custom: Custom) -> str:
+    arguments = ", ".join(f"{name} {short_repr(value)}" for name, value in custom.arguments.items())
     words = f"{custom.target} ({arguments})" if arguments else custom.target
-    target = _LIVE.get(custom.live) if custom.live else _imported(custom.target)
+    target = _LIVE.get(custom.live) if custom.live else _find_imported(custom.target)
     lines = str(getattr(target, "__doc__", None) or "").strip().splitlines()
     words = f"{words}: {lines[0].rstrip('.')}" if lines else words
-    return _on_a_line(words)
+    return _printable(words)
 
 
 def refuse_targets(table: object) -> None:
-    """Raise a ValueError for a table that would import what this process does not trust, or that has what
-    another process was handed live."""
-    refuse_live(table, of_others=True)
+    """Raise a ValueError for a table with untrusted user code, or with live objects of another process."""
+    refuse_live(table, only_foreign=True)
     refused = [target for target in custom_targets(table) if target not in _TRUSTED]
     if refused:
-        refused = list(map(_on_a_line, refused))
+        refused = list(map(_printable, refused))
         flags = " ".join(f"--allow {target}" for target in refused)
         names = ", ".join(map(repr, refused))
         raise ValueError(
@@ -241,45 +245,44 @@ def refuse_targets(table: object) -> None:
         )
 
 
-def _tables_of_customs(table: object) -> Iterator[Mapping[str, Any]]:
+def _custom_tables(table: object) -> Iterator[Mapping[str, Any]]:
     if isinstance(table, Mapping):
         entries: Any = table
         if table.get("kind") == "Custom":
             yield table
             entries = table.get("arguments")
         for entry in entries.values() if isinstance(entries, Mapping) else ():
-            yield from _tables_of_customs(entry)
+            yield from _custom_tables(entry)
     elif isinstance(table, list | tuple):
         for entry in table:
-            yield from _tables_of_customs(entry)
+            yield from _custom_tables(entry)
 
 
-_IMPORTED: Final[dict[str, tuple[object, str | None]]] = {}
-"""The text of each module that was imported, with its `__spec__`, which is another after a reload."""
+_SOURCES: Final[dict[str, tuple[object, str | None]]] = {}
+"""The source of each imported module, with its `__spec__`, which changes at a reload."""
 
 
 def source_of(module: str) -> str | None:
-    """Return the text of a module, without importing it; of one that is imported, the text that runs.
+    """Return the source of a module without importing it; None if it has no file, e.g. in a notebook.
 
-    A file that is edited after a `Custom` of it was made does not change it before it is imported anew. None
-    where there is no file, e.g. for what was typed into a notebook.
+    For an imported module this is the source that runs, even if its file was edited since.
     """
     imported = sys.modules.get(module)
     try:
         spec = find_spec(module) if imported is None else imported.__spec__
         loader: Any = spec.loader if spec is not None else getattr(imported, "__loader__", None)
-        if imported is not None and module in _IMPORTED and _IMPORTED[module][0] is spec:
-            return _IMPORTED[module][1]
+        if imported is not None and module in _SOURCES and _SOURCES[module][0] is spec:
+            return _SOURCES[module][1]
         text: str | None = loader.get_source(module)
     except (ImportError, AttributeError, ValueError):
         return None
     if imported is not None:
-        _IMPORTED[module] = spec, text
+        _SOURCES[module] = spec, text
     return text
 
 
 class _Repr(reprlib.Repr):
-    """Short, and without what objects say of themselves: by their class."""
+    """A short representation, in which objects appear as their class instead of by their own `__repr__`."""
 
     def repr_instance(self, x: Any, level: int) -> str:
         if isinstance(x, type):
@@ -289,25 +292,27 @@ class _Repr(reprlib.Repr):
 
 
 _REPR: Final = _Repr()
-_REPR.maxlevel, _REPR.maxtuple, _REPR.maxlist, _REPR.maxstring, _REPR.maxother = 4, 20, 20, 120, 120
+_REPR.maxlevel = 4
+_REPR.maxtuple = _REPR.maxlist = 20
+_REPR.maxstring = _REPR.maxother = 120
 
 
-def shown(value: object) -> str:
-    """Return a value as a message shows it, on one line and not at full length; an object by its class."""
+def short_repr(value: object) -> str:
+    """Return a value as short text for a message, on one line; an object as its class."""
     try:
         return " ".join(_REPR.repr(value).split())
-    except Exception:  # a user's object may raise anything, and an integer may have too many digits
+    except Exception:  # a `__repr__` may raise anything, and an integer may be too long to print
         return f"a {type(value).__name__} that cannot be shown"
 
 
-def made(value: Any, *positional: Any) -> Any:
-    """Return what a `Custom` makes; anything else as it is."""
+def instantiate(value: Any, *positional: Any) -> Any:
+    """Return what a `Custom` makes; return anything else unchanged."""
     return value.make(*positional) if isinstance(value, Custom) else value
 
 
 def refuse_other_keys(value: Any, *, most: int = MOST_NESTED, depth: int = 0) -> None:
-    """Refuse a value with tables by something else than text, which JSON would turn into text, and one that
-    is nested too deep for functions that call themselves."""
+    """Refuse a value with keys that are no text, which JSON would turn into text, and one that is nested too
+    deep for recursive functions."""
     if depth > most:
         raise ValueError(f"it is nested more than {most} deep")
     if isinstance(value, Mapping):
@@ -319,24 +324,23 @@ def refuse_other_keys(value: Any, *, most: int = MOST_NESTED, depth: int = 0) ->
             refuse_other_keys(entry, most=most, depth=depth + 1)
 
 
-def _table_of(value: object) -> Any:
-    """Return a value of cprl as JSON can hold it; what `json.dumps` calls for what is not of JSON."""
+def _to_json(value: object) -> Any:
+    """Return a value of cprl as JSON can hold it; `json.dumps` calls it for everything else than JSON."""
     from cprl.values import to_config
 
     return to_config(value, f"a {type(value).__name__}")
 
 
-def _argument(value: Any) -> Any:
-    """Return an argument as a target gets it."""
+def _to_argument(value: Any) -> Any:
+    """Return an argument as the target gets it."""
     if isinstance(value, Mapping):
         from cprl.values import from_config, is_value
 
         return from_config(value) if is_value(value) else value
-    if not isinstance(value, list):
-        return value
-    return [
-        tuple(entry)
-        if isinstance(entry, list) and all(isinstance(part, str) for part in entry)
-        else _argument(entry)
-        for entry in value
-    ]
+    return list(map(_to_list_entry, value)) if isinstance(value, list) else value
+
+
+def _to_list_entry(value: Any) -> Any:
+    """Return an entry of a list as the target gets it: a list of texts, such as a nested key, as a tuple."""
+    is_key = isinstance(value, list) and all(isinstance(part, str) for part in value)
+    return tuple(value) if is_key else _to_argument(value)

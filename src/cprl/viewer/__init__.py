@@ -8,12 +8,11 @@ Modules, in the order in which one reads them:
     page       Rerun's viewers, native and in a browser
     live       the streams of a recording, to a file and served live, each of which may fail without harm
     logger     RerunLogger: TorchRL's logger interface on a recording
-    views      View, a part of a recording: lines over episodes
+    view       View, a part of a recording; lines over episodes
     frames     which episodes are recorded turn by turn; the boards of all replicas
-    pictures   who tagged whom, where agents go, stock over the turn, Lorenz curve: functions of what was seen
-    story      header, live label, and events
-    exhibition a world that the current policy plays, for viewers alone
-    replay     what policies say of their actions, who breaks a rule, and what is paid
+    pictures   tags, visits, stock over the turn, Lorenz curve: functions of the episodes seen
+    header     the header, the live label, and events
+    replay_views  action values, violations and payments, turn by turn in a replay
     callback   ViewerCallback: shows a training while it runs, by a list of views
 
 Each imports only from those above it.

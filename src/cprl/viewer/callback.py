@@ -1,4 +1,4 @@
-"""ViewerCallback: records a training for the Rerun viewer, and shows it live."""
+"""ViewerCallback: records a training for the Rerun viewer, and shows it live on request."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from math import ceil, gcd
@@ -13,59 +13,62 @@ from torchrl.envs import EnvBase
 
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import action_count, agent_names, commons_of
-from cprl.measuring.episodes import Episode, own_name
-from cprl.measuring.evaluate import Policy
+from cprl.measuring.playing import Policy
 from cprl.measuring.registry import reported_by
 from cprl.measuring.series import Observer
+from cprl.measuring.tracker import Episode, custom_metric_name
 from cprl.pictures.readable import rules_of
-from cprl.policies.present import PresentPolicy
 from cprl.runs.episodes import stored_episodes
-from cprl.runs.recipe import read_recipe, rules_of_own
+from cprl.runs.recipe import custom_rules_in, read_recipe
 from cprl.system.output import console
-from cprl.system.process import at_signals
-from cprl.values.arrays import Float64
-from cprl.viewer.exhibition import Exhibition
-from cprl.viewer.frames import Filming, Wall
+from cprl.system.process import on_signals
+from cprl.values.array_types import Float64
+from cprl.viewer.frames import FrameSchedule, Wall
+from cprl.viewer.header import CompilingNotice, Events, Header, HeaderView
 from cprl.viewer.logger import RerunLogger, recording_id
-from cprl.viewer.page import FILE_NAME, recordings_of
+from cprl.viewer.page import RECORDING_FILE, recordings_of
 from cprl.viewer.pictures import Pictures, Samples, borders, regions_of
-from cprl.viewer.scene import curves_of, missing_in, scene_of
-from cprl.viewer.story import CompilingNotice, Events, Header, Story
-from cprl.viewer.views import JointActions, Plots, View
+from cprl.viewer.scene import missing_in, plotted_numbers, scene_of
+from cprl.viewer.view import Exhibit, JointActions, Plots, View
 
-LONGEST: Final = 50
-"""Episodes from one image of visits, stock and Lorenz curve to the next, at most."""
-_IMAGES: Final = 20
-"""The images of a short run, about."""
+_MOST_EPISODES_BETWEEN: Final = 50
+"""The largest number of episodes between two pictures of visits, stock and Lorenz curve."""
+_PICTURES_OF_A_SHORT_RUN: Final = 20
+"""About how many times these pictures are drawn in a run that is too short for that distance."""
 
 
 class ViewerCallback:
-    """Logs the metrics of every episode, and the frames of the first world in some episodes.
+    """Records the metrics of every episode, and the frames of the first world in some episodes.
 
-    Views that need what the game does not report are left out: a game without a board has no frames; for
-    metrics see `cprl.measuring.registry`. One event of the recording names them. With transforms, windows
-    show the observations of the `CommonsEnv` itself.
+    It is a callback of `cprl.training` and a context manager. It passes each call to its views, each of which
+    records one part of the training, such as the plots or the header.
 
-    Frames are recorded for every k-th episode of that world, including the first and the last, and for the
-    episode after each new best. With several replicas metrics are logged once all have ended an episode: the
-    mean and each replica; returns, losses and the like as means only. With W worlds a replica, metrics are
-    means over every W episodes. Header, board and timelines count the episodes that all replicas have ended.
-    A callback of `cprl.training`, and a context manager.
+    A view is left out if the game does not report what it needs: a game without a board has no frames. Events
+    at the start of the recording name the views that are left out. The windows show the observations of the
+    `CommonsEnv` itself, before transforms.
 
-    Of a run that is resumed the views get the episodes in its table, and viewers the recording so far.
+    Frames are recorded for every k-th episode of the first world, including the first and the last, and for
+    the episode after each new best. With several replicas, metrics are logged when all replicas have ended an
+    episode: the mean and each replica; of returns, losses and the like only the mean. With W worlds per
+    replica, a logged metric is the mean of W episodes. Header, board and timelines count the episodes that
+    all replicas have ended.
+
+    When a run is resumed, the views get the episodes of its table, and viewers get the recording so far.
 
     Args:
-        run: the run's directory, where the recording is written. If there is one already, the new file is
-            `run-2.rrd` and so on; the viewer shows them as one recording.
-        env: the worlds of all replicas, with transforms or without; the first is shown.
-        episodes: of each replica.
-        is_about: whether it is only about as many, because so many steps are trained.
-        worlds: the worlds W of each replica.
-        metrics: the names of the user's own.
-        live: "serve" or "spawn", see `cprl.viewer.live`; None for the file alone.
-        exhibited: what is exhibited live: the current policy and one world for it, see
-            `cprl.viewer.exhibition`.
-        file_name: the name of the recording instead of `run.rrd`; there must be no such file.
+        run: the run's directory, to which the recording is written. If it has a recording already, the new
+            file is `run-2.rrd` and so on; the viewer shows them as one recording.
+        env: the worlds of all replicas, with or without transforms; the first world is shown.
+        title: the name of the recording.
+        episodes: the number of episodes of each replica.
+        is_about: whether `episodes` is an estimate, because the training counts steps.
+        worlds: the number of worlds W of each replica.
+        metrics: the names of the user's metrics.
+        recipe: the recipe of the run, which the recording shows as a table.
+        live: "serve" or "spawn", see `cprl.viewer.live`; None writes the file only.
+        exhibit: makes the view that plays the current policy for live viewers, see
+            `cprl.experimental.exhibition`; None for no such view.
+        file_name: the name of the recording instead of `run.rrd`; this file must not exist.
         is_replay: whether a stored policy is replayed, see `cprl.viewer.scene.Scene`.
     """
 
@@ -83,7 +86,7 @@ class ViewerCallback:
         metrics: Sequence[str] = (),
         recipe: Mapping[str, object] | None = None,
         live: str | None = None,
-        exhibited: tuple[PresentPolicy, EnvBase] | None = None,
+        exhibit: Exhibit | None = None,
         file_name: str | None = None,
         is_replay: bool = False,
     ) -> None:
@@ -91,48 +94,52 @@ class ViewerCallback:
         self._run = run
         reported = reported_by(env)
         commons = commons_of(env)
-        curves = curves_of(env, agent_names(env), reported, episodes=episodes, worlds=worlds, own=metrics)
+        curves = plotted_numbers(
+            env, agent_names(env), reported, episodes=episodes, worlds=worlds, user_metrics=metrics
+        )
         scene = None if commons is None else scene_of(commons, curves, is_replay=is_replay)
         self._earlier = [] if file_name else recordings_of(run)
+        new_file = f"run-{len(self._earlier) + 1}.rrd" if self._earlier else RECORDING_FILE
         self.logger = RerunLogger(
             title,
             run,
             curves=scene or curves,
             live=live,
-            exhibits=exhibited is not None and scene is not None,
-            file_name=file_name or (f"run-{len(self._earlier) + 1}.rrd" if self._earlier else FILE_NAME),
-            recording_id=recording_id(run, file_name or FILE_NAME),
+            exhibits=exhibit is not None and scene is not None,
+            file_name=file_name or new_file,
+            recording_id=recording_id(run, file_name or RECORDING_FILE),
         )
-        self.filming = Filming(commons, self.logger, episodes=-(-episodes // worlds))
-        """Which episodes of the first world are recorded frame by frame."""
-        self._turn = self._episode = 0
-        """Turns, and episodes that all replicas have ended: what header, board and timelines say."""
-        self.logger.log_hparams({"run": run.name, **(recipe or {})})
-        self.logger.log_text(f"{title} begins")
-        for missing in missing_in(reported, has_board=scene is not None):
-            self.logger.log_text(missing)
+        self.schedule = FrameSchedule(commons, self.logger, episodes=-(-episodes // worlds))
+        self._turn = 0
+        self._episode = 0
+        """The number of episodes that all replicas have ended."""
+        recipe = recipe or {}
+        self.logger.log_hparams({"run": run.name, **recipe})
+        events = [f"{title} begins", *missing_in(reported, has_board=scene is not None)]
         if live and scene is None:
-            self.logger.log_text("no exhibition: the game has no board")
-        self.story: Story | None = None
-        self.exhibition: Exhibition | None = None
-        """What the current policy plays for viewers; None where nothing is exhibited."""
-        every = max(1, min(LONGEST, episodes // _IMAGES))
+            events.append("no exhibition: the game has no board")
+        for event in events:
+            self.logger.log_text(event)
+        self.header_view: HeaderView | None = None
+        self.exhibition: View | None = None
+        """The view that plays the current policy for live viewers; None if nothing is exhibited."""
+        picture_period = max(1, min(_MOST_EPISODES_BETWEEN, episodes // _PICTURES_OF_A_SHORT_RUN))
         self._views: list[View] = [
-            self.filming,
+            self.schedule,
             Plots(self.logger),
-            Events(self.logger, self.filming, every=ceil(every / worlds)),
+            Events(self.logger, self.schedule, every=ceil(picture_period / worlds)),
         ]
         if curves.joint:
             self._views.append(JointActions(self.logger, actions=action_count(env)))
         if commons is not None:
-            self._views += self._views_of_boards(commons, exhibited)
+            self._views += self._board_views(commons, exhibit)
         if not is_replay:
             game = None if commons is None else commons.game
-            rules = ", ".join(filter(None, (rules_of(game), rules_of_own(recipe or {}))))
+            rules = ", ".join(filter(None, (rules_of(game), custom_rules_in(recipe))))
             header = Header(curves=self.logger.curves, episodes=episodes, rules=rules, is_about=is_about)
-            self._views += self._views_of_a_training(commons, header, every)
-        self._sampled = gcd(*(view.stride for view in self._views)) or 1
-        """Turns from one look at the worlds to the next where no frame is recorded."""
+            self._views += self._training_views(commons, header, picture_period)
+        self._step_stride = gcd(*(view.stride for view in self._views)) or 1
+        """Turns between two calls of the views' `on_step` in episodes without frames."""
 
     @classmethod
     def of(
@@ -142,11 +149,15 @@ class ViewerCallback:
         env: EnvBase,
         *,
         live: str | None = None,
-        exhibited: tuple[PresentPolicy, EnvBase] | None = None,
+        exhibit: Exhibit | None = None,
     ) -> Self:
-        """Return what shows the training of an `Experiment`, whose recipe is in the run's directory."""
+        """Return the callback that records the training of an `Experiment`.
+
+        Args:
+            run: the run's directory, which holds the recipe already.
+        """
         recipe = read_recipe(run)
-        circumstances = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
+        start_conditions = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
         return cls(
             run,
             env,
@@ -154,85 +165,89 @@ class ViewerCallback:
             episodes=experiment.length.episodes,
             is_about=experiment.length.is_of_steps,
             worlds=experiment.worlds,
-            metrics=[own_name(metric) for metric in experiment.metrics],
-            recipe={**recipe["experiment"], **circumstances},
+            metrics=[custom_metric_name(metric) for metric in experiment.metrics],
+            recipe={**recipe["experiment"], **start_conditions},
             live=live,
-            exhibited=exhibited,
+            exhibit=exhibit,
         )
 
-    def _views_of_boards(
-        self, commons: CommonsEnv, exhibited: tuple[PresentPolicy, EnvBase] | None
-    ) -> Iterator[View]:
-        if regions := regions_of(commons):
+    def _board_views(self, commons: CommonsEnv, exhibit: Exhibit | None) -> Iterator[View]:
+        """Yield the exhibition, if there is one; log the borders of regions."""
+        regions = regions_of(commons)
+        if regions:
             self.logger.log_static("world/regions", borders(regions))
         live = self.logger.live
-        if exhibited is not None and live is not None and live.exhibition is not None:
-            self.exhibition = Exhibition(*exhibited, trained=self.env, logger=self.logger)
+        if exhibit is not None and live is not None and live.exhibition is not None:
+            self.exhibition = exhibit(self.env, self.logger)
             yield self.exhibition
 
-    def _views_of_a_training(self, commons: CommonsEnv | None, header: Header, every: int) -> Iterator[View]:
+    def _training_views(
+        self, commons: CommonsEnv | None, header: Header, picture_period: int
+    ) -> Iterator[View]:
+        """Yield the views that a training has and a replay lacks."""
         logger = self.logger
         scene = self.logger.scene
         samples = None
         if commons is not None and scene is not None:
             if scene.boards > 1:
-                recorded = header.episodes // scene.worlds // max(1, self.filming.every) + 1
-                steps = commons.game.rules.episode_steps * recorded
-                yield Wall(commons, logger, self.filming, scene, recorded_steps=steps)
+                recorded_episodes = header.episodes // scene.worlds // max(1, self.schedule.every) + 1
+                recorded_steps = commons.game.rules.episode_steps * recorded_episodes
+                yield Wall(commons, logger, self.schedule, scene, recorded_steps=recorded_steps)
             samples = Samples(commons, logger)
             yield samples
-        yield Pictures(logger, samples, every=every)
-        self.story = Story(logger, self.filming, header)
-        yield self.story
+        yield Pictures(logger, samples, every=picture_period)
+        self.header_view = HeaderView(logger, self.schedule, header)
+        yield self.header_view
         if logger.live is not None:
             yield CompilingNotice(self._show_status)
 
     def _show_status(self, status: str) -> None:
-        if self.story is not None and self._episode == 0:
-            self.story.begins(status)
+        if self.header_view is not None and self._episode == 0:
+            self.header_view.begins(status)
 
     def on_start(self, training: Any) -> None:
-        """Go on where a `Training` that is resumed is: views get the episodes that the run's table has, and
-        viewers the recording so far."""
+        """Continue the recording if the `Training` is resumed.
+
+        The views get the episodes of the run's table, and viewers get the recording so far.
+        """
         if not training.steps:
             return
         worlds = self.logger.curves.worlds
         self._turn = training.steps // worlds
-        again = Observer([self], self.env, worlds=worlds)
+        repeating = Observer([self], self.env, worlds=worlds)
         with self.logger.silent():
             for episode in stored_episodes(self._run):
-                again.on_episode(episode, {})
+                repeating.on_episode(episode, {})
         for recording in self._earlier:
-            self.logger.do(methodcaller("log_file_from_path", recording), live_only=True)
+            self.logger.call_on_recordings(methodcaller("log_file_from_path", recording), live_only=True)
         self._set_time(max(0, self._episode - 1))
         for view in self._views:
             view.resumed()
         self.logger.log_text(f"resumed from step {training.steps:,}")
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Let the views look at the worlds after the turn, if the first one's frames are recorded or one of
-        them needs to.
+        """Pass a turn to the views, if its frame is recorded or a view needs it.
 
-        Otherwise it only counts: whatever runs here displaces a training's data from the fast caches.
+        Other turns are only counted: any work here would displace the training's data from the CPU caches.
         """
         self._turn += 1
-        if not self.filming.is_on and self._turn % self._sampled:
+        if not self.schedule.is_on and self._turn % self._step_stride:
             return
         self._set_time(self._episode)
         for view in self._views:
             view.on_step(batch)
 
     def _set_time(self, episode: int) -> None:
-        self.logger.at(step=self._turn * self.logger.curves.worlds, episode=episode)
+        self.logger.set_time(step=self._turn * self.logger.curves.worlds, episode=episode)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Add an episode of a replica, and log its events."""
+        """Pass an episode of one world to the views."""
         self._set_time(self._episode)
         for view in self._views:
             view.on_episode(episode, learning)
 
     def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
-        """Draw the numbers of an episode that all replicas have ended."""
+        """Log the numbers of an episode that all replicas have ended."""
         self._episode = episode + 1
         self._set_time(episode)
         for view in self._views:
@@ -240,32 +255,34 @@ class ViewerCallback:
         self.logger.send_due()
 
     def seen_at_random(self, env: EnvBase, policy: Policy) -> Policy:
-        """Return the policy of random play; viewers see its first world until the training begins."""
-        return policy if self.exhibition is None else self.exhibition.seen(env, policy)
+        """Return the policy of random play; live viewers see its first world until the training begins."""
+        return policy if self.exhibition is None else self.exhibition.watch_random_play(env, policy)
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
-        """Compare the training with these episodes of random play: in header, label, plots and an event."""
+        """Compare the training with these episodes of random play in header, label, plots and an event."""
         for view in self._views:
             view.random_play(episodes)
 
     def finished(self, played: Mapping[str, Sequence[Episode]]) -> None:
-        """Show that the run is finished, and close the file; a live view stays open until the end."""
-        self.filming.close()
+        """Show that the run is finished, and close the file; the live recording stays open."""
+        self.schedule.close()
         for view in self._views:
             view.finished(played)
         self.logger.close_file()
 
     def linger(self) -> None:
-        """Say where the recording stays served, exhibit the trained policy, wait for Ctrl-C (SIGINT) or
-        SIGTERM, and close the recording; a second signal in the meantime changes nothing."""
+        """Keep the recording served and exhibit the trained policy until Ctrl-C (SIGINT) or SIGTERM.
+
+        Further signals have no effect while the recording is closed.
+        """
         if not self.logger.is_live:
             console().print("The recording is no longer served.")
             return
         stopping = Event()
-        with at_signals(lambda number: stopping.set()):
-            where = self.logger.addresses["browser"]
+        with on_signals(lambda number: stopping.set()):
+            address = self.logger.addresses["browser"]
             console().print(
-                f"The recording stays served at {where} until Ctrl-C", soft_wrap=True, highlight=False
+                f"The recording stays served at {address} until Ctrl-C", soft_wrap=True, highlight=False
             )
             self.play_on(stopping)
             while not stopping.wait(1.0):
@@ -273,17 +290,17 @@ class ViewerCallback:
             self.logger.shutdown()
 
     def play_on(self, stop: Event) -> None:
-        """Exhibit the trained policy until the event is set; return at once where nothing is exhibited."""
+        """Exhibit the trained policy until the event is set; return at once if nothing is exhibited."""
         if self.exhibition is not None:
             self.exhibition.play_on(stop)
 
     def flush(self) -> None:
-        """Send all that waits, to the file and to viewers."""
-        self.filming.close()
+        """Send all recorded frames and numbers, to the file and to viewers."""
+        self.schedule.close()
         self.logger.flush()
 
     def state_dict(self) -> dict[str, Any]:
-        """Return what does not follow from the run's table; the recording is complete up to here."""
+        """Complete the recording up to now; return the number of its frames, which the run's table lacks."""
         self.flush()
         return {"frames": self.logger.frames}
 

@@ -1,10 +1,10 @@
-"""Frames: which episodes are recorded turn by turn, and how the boards of all replicas go on beside them."""
+"""Frames of the board: which episodes are recorded turn by turn, and the small boards of all replicas."""
 
 import time
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from math import ceil
-from typing import Any, Final, TypeAlias
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -14,25 +14,27 @@ from tensordict import TensorDictBase
 from cprl import keys
 from cprl.commons.cells import BEAM
 from cprl.envs.commons_env import CommonsEnv
-from cprl.measuring.episodes import Episode
+from cprl.measuring.tracker import Episode
 from cprl.pictures.decoding import UNSEEN, classes_seen
-from cprl.values.arrays import UInt8
-from cprl.viewer.board import Frames, boards, image_form
+from cprl.values.array_types import UInt8
+from cprl.viewer.board import Frames, boards, image_format
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import DIED, TEXT
 from cprl.viewer.scene import Scene, boards_of, windows_of
-from cprl.viewer.views import View, has_died
+from cprl.viewer.view import View, has_died
 
 FRAMES_BYTES: Final = 45_000_000
-"""The target size of a file's regular frames, about; the frames after new bests come on top."""
-_PERIOD_S: Final = 1.0
-_FEWEST_FRAMES, _MOST_FRAMES = 50, 5000
-"""Frames are sent when an episode ends, when there are many, or after a second if there are some: each chunk
-has overhead."""
+"""About the size of a file's regular frames; the frames after new bests add to it."""
+_SEND_PERIOD_S: Final = 1.0
+"""Seconds after which frames are sent before their episode ends, if they are at least `_FEWEST_FRAMES`."""
+_FEWEST_FRAMES: Final = 50
+"""The smallest number of frames that is sent within an episode, because each send has overhead."""
+_MOST_FRAMES: Final = 5000
+"""The number of frames that is sent at once, however little time has passed."""
 
 
 class FrameRecorder:
-    """Copies the state of the first world after each step, and returns the frames when they are due.
+    """Copies the state of the first world after each step, until `take` is called.
 
     Windows show the observations of the `CommonsEnv` itself, without transforms.
     """
@@ -43,18 +45,23 @@ class FrameRecorder:
         self._has_windows = has_windows
         self._frames: list[dict[str, NDArray[Any]]] = []
         self._tagged_by = np.full(env.game.agents, -1, np.int32)
-        """Who tagged each agent last; -1 if unknown."""
+        """The agent that tagged each agent last; -1 if unknown."""
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def add(self, batch: TensorDictBase | None = None, *, step: int = 0, episode: int = 0) -> None:
-        """Copy a frame; `batch` is the latest step, None before the first of an episode, and `step` counts
-        those of the whole run."""
-        if batch is not None and self._has_tags:  # of several shooters the first
+        """Copy a frame.
+
+        Args:
+            batch: the latest step; None before the first one of an episode.
+            step: the number of steps of the whole run.
+        """
+        if batch is not None and self._has_tags:
             tagged_by = batch["next"][keys.TAGGED_BY][0].cpu().numpy()
             tagged = tagged_by.any(1)
-            self._tagged_by[tagged] = tagged_by.argmax(1)[tagged]
+            first_shooter = tagged_by.argmax(1)
+            self._tagged_by[tagged] = first_shooter[tagged]
         board = self._env.worlds.show(self._env.output)
         frame = {"step": step, "episode": episode, "beams": board.board == BEAM, "tagged_by": self._tagged_by}
         for name in ("stock", "row", "col", "heading", "in_play", "harvested"):
@@ -64,141 +71,174 @@ class FrameRecorder:
         self._frames.append({name: np.array(value) for name, value in frame.items()})
 
     def take(self) -> Frames | None:
-        """Return all frames as columns, [T, ...] each, for `RerunLogger.log_frames`, or None."""
-        taken = self._frames
+        """Return the frames since the last call as columns [T, ...], for `RerunLogger.log_frames`.
+
+        Return None if there are no frames.
+        """
+        rows = self._frames
         self._frames = []
-        if not taken:
+        if not rows:
             return None
-        frames = {name: np.stack([frame[name] for frame in taken]) for name in taken[0]}
+        columns = zip(*(row.values() for row in rows), strict=True)
+        frames = dict(zip(rows[0], map(np.stack, columns), strict=True))
         if self._has_windows:
             frames["windows"] = classes_seen(self._env.game, frames["windows"])
         return frames
 
 
-class Filming(View):
-    """Logs the frames of the first world in every k-th episode, including the first and the last, and in the
-    episode after each new best.
+class FrameSchedule(View):
+    """Decides in which episodes of the first world each turn is recorded, and logs these frames.
+
+    They are every k-th episode, including the first and the last, and the episode after each new best; k is
+    chosen so that the file's size stays near `FRAMES_BYTES`.
 
     Args:
-        env: the worlds; None for a game without a board, of which there are no frames.
-        episodes: that the first world plays.
+        env: the worlds; None for a game without a board, which has no frames.
+        episodes: the number of episodes that the first world plays.
     """
 
     def __init__(self, env: CommonsEnv | None, logger: RerunLogger, *, episodes: int) -> None:
         self._logger = logger
-        self._last = episodes - 1
-        self._sent = time.perf_counter()
+        self._last_episode = episodes - 1
+        self._last_sent = time.perf_counter()
         self._recorder: FrameRecorder | None = None
         self._ended = 0
-        self._shows = False
+        """The number of episodes that the first world has ended."""
+        self._is_requested = False
+        """Whether `show` asks for the frames of the running episode."""
         self.was_on = False
         """Whether the last episode of the first world was recorded."""
         self.every = 0
-        """Episodes from one with frames to the next; 0 for no frames."""
+        """The distance k between two recorded episodes; 0 for no frames."""
         self.frame: int | None = None
         """The number of the frame of this turn, if it has one."""
-        if env is not None and (scene := logger.scene) is not None:
+        scene = logger.scene
+        if env is not None and scene is not None:
             self._recorder = FrameRecorder(env, scene)
             rows, columns = windows_of(len(scene.agents), scene.window).shape
-            # The largest size of a frame, about; with a trained population on `commons` it is 500 bytes.
-            size = 80 + 45 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
-            self.every = max(1, ceil(episodes * env.game.rules.episode_steps * size / FRAMES_BYTES))
+            # An upper estimate; a trained population on the map `commons` takes 500 bytes.
+            frame_bytes = 80 + 45 * len(scene.agents) + 0.35 * (rows * columns + scene.height * scene.width)
+            run_bytes = episodes * env.game.rules.episode_steps * frame_bytes
+            self.every = max(1, ceil(run_bytes / FRAMES_BYTES))
         self.is_on = self.is_shown(0)
         """Whether the running episode is recorded."""
 
     def is_shown(self, episode: int) -> bool:
-        """Return whether the frames of an episode that runs now are recorded."""
-        is_chosen = self.every > 0 and (episode % self.every == 0 or self._shows or episode == self._last)
-        return is_chosen and episode <= self._last
+        """Return whether the frames of the running episode, which has this index, are recorded."""
+        if self.every == 0 or episode > self._last_episode:
+            return False
+        return episode % self.every == 0 or self._is_requested or episode == self._last_episode
 
-    def show(self, *, shows: bool = True) -> None:
-        """Record the running episode in any case."""
-        self._shows = shows
+    def show(self) -> None:
+        """Record the running episode from this turn on, even if it is no k-th episode."""
+        self._is_requested = True
         self.is_on = self.is_shown(self._ended)
 
     def on_step(self, batch: TensorDictBase) -> None:
-        """Copy a frame if this episode's are recorded."""
+        """Copy a frame if the running episode is recorded."""
         self.frame = None
         if self._recorder is None or not self.is_on:
             return
-        # Where an episode ends, the board is already that of the next one.
+        # After the last turn of an episode the board is already that of the next episode.
         if keys.entry(keys.entry(batch, "next"), keys.DONE)[0, 0]:
             self.close()
             return
         self._recorder.add(batch, step=self._logger.step, episode=self._logger.episode)
         count = len(self._recorder)
         self.frame = self._logger.frames + count - 1
-        waited_s = time.perf_counter() - self._sent
-        if count >= _MOST_FRAMES or (waited_s > _PERIOD_S and count >= _FEWEST_FRAMES):
+        waited_s = time.perf_counter() - self._last_sent
+        if count >= _MOST_FRAMES or (waited_s > _SEND_PERIOD_S and count >= _FEWEST_FRAMES):
             self.close()
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         if episode.world == 0:
             self._ended += 1
             self.was_on = self.is_on
-            self.show(shows=False)
+            self._is_requested = False
+            self.is_on = self.is_shown(self._ended)
 
     def close(self) -> None:
-        """Log the frames so far."""
-        self._sent = time.perf_counter()
+        """Log the frames that have not been sent."""
+        self._last_sent = time.perf_counter()
         frames = None if self._recorder is None else self._recorder.take()
         if frames is not None:
             self._logger.log_frames(frames)
 
 
 WALL_BYTES: Final = 4_000_000
-"""The target size of the wall in a file, about."""
+"""About the size of the wall in a file."""
 _LIVE_PERIOD_S: Final = 2.0
+"""The shortest time between two rows for viewers, in seconds."""
 _LIVE_ROWS: Final = 10_000
-"""From then on rows for viewers get rarer, because a server's memory holds them: period = time / rows."""
+"""About the largest number of rows for viewers, because they stay in a server's memory. Later in a long run
+the time between two rows is the time since the start, divided by this number."""
 _FEWEST_STEPS: Final = 10
-"""Steps from one row of the file to the next, at least."""
+"""The smallest number of steps between two rows of the file."""
 _LABELLED: Final = 8
-"""The largest number of boards whose labels say "turn" before its number."""
-_Row: TypeAlias = tuple[int, int, int, UInt8, list[str], UInt8]
-"""A step, episode and frame, the image, and the text of each board and its colour."""
+"""The largest number of boards whose labels say "turn" before its number; more labels would overlap."""
+
+
+class _WallRow(NamedTuple):
+    """All boards at one time."""
+
+    step: int
+    episode: int
+    frame: int
+    image: UInt8
+    """uint8 [rows, columns], the boards side by side, as classes."""
+    labels: list[str]
+    """The text above each board."""
+    colours: UInt8
+    """uint8 [boards, 3], the colour of each text."""
 
 
 class Wall(View):
-    """Logs the boards of all replicas, or of the first worlds of one: same rules, as many fates.
+    """Logs the boards of all replicas side by side, or those of the first worlds of a single replica.
 
-    Viewers get them every two seconds, after hours more rarely; the file gets every so many steps of the
-    episodes whose frames are recorded. The text of a board says its turn, in orange if the episode of its
-    world before this one ended because no apple was left.
+    Viewers get them every two seconds, and less often after some hours. The file gets every k-th step of the
+    episodes whose frames are recorded. The text above a board says its turn; it is orange if the world's
+    previous episode ended early because no apple was left.
 
     Args:
-        recorded_steps: the steps of the run whose frames are recorded, about; determines how many have a row.
+        recorded_steps: about how many steps of the run have a frame; k is chosen so that the size of the wall
+            stays near `WALL_BYTES`.
     """
 
     def __init__(
-        self, env: CommonsEnv, logger: RerunLogger, filming: Filming, scene: Scene, *, recorded_steps: int
+        self,
+        env: CommonsEnv,
+        logger: RerunLogger,
+        schedule: FrameSchedule,
+        scene: Scene,
+        *,
+        recorded_steps: int,
     ) -> None:
         self._env = env
         self._logger = logger
-        self._filming = filming
+        self._schedule = schedule
         self._scene = scene
         self._panels = boards_of(scene, scene.boards)
         rows, columns = self._panels.shape
         row_bytes = 100 + 20 * scene.boards + 0.35 * rows * columns
-        self._apart = max(_FEWEST_STEPS, ceil(recorded_steps * row_bytes / WALL_BYTES))
+        self._step_period = max(_FEWEST_STEPS, ceil(recorded_steps * row_bytes / WALL_BYTES))
         self._died = np.zeros(scene.boards, np.bool_)
-        self._rows: list[_Row] = []
-        self._began = self._due = time.perf_counter()
-        form = rr.SegmentationImage.from_fields(format=image_form(self._panels.shape), opacity=1.0)
-        logger.log_static("wall/boards", form)
+        self._rows: list[_WallRow] = []
+        self._began = self._live_due = time.perf_counter()
+        wall_image = rr.SegmentationImage.from_fields(format=image_format(self._panels.shape), opacity=1.0)
+        logger.log_static("wall/boards", wall_image)
         logger.log_static("wall/labels", self._panels.labels(colours=None))
 
     def on_step(self, batch: TensorDictBase) -> None:
-        frame = self._filming.frame
-        if frame is not None and self._logger.turn % self._apart == 0:
+        frame = self._schedule.frame
+        if frame is not None and self._logger.turn % self._step_period == 0:
             self._rows.append(self._row(frame))
-        elif (now := time.perf_counter()) > self._due:
-            self._due = now + max(_LIVE_PERIOD_S, (now - self._began) / _LIVE_ROWS)
+        elif (now := time.perf_counter()) > self._live_due:
+            self._live_due = now + max(_LIVE_PERIOD_S, (now - self._began) / _LIVE_ROWS)
             if self._logger.is_live:
                 self._log([self._row(self._logger.frames)], live_only=True)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
-        """Note whether the board has died, and log the rows of the episode."""
+        """Remember whether the board has died; log the rows of the first world's episode."""
         if episode.world < len(self._died):
             self._died[episode.world] = bool(has_died(episode))
         if episode.world == 0:
@@ -209,24 +249,24 @@ class Wall(View):
             self._log(self._rows)
             self._rows = []
 
-    def _row(self, frame: int) -> _Row:
-        now = self._env.worlds.now
+    def _row(self, frame: int) -> _WallRow:
+        worlds = self._env.worlds.now
         read = self._env.worlds.driver.read
         count = len(self._died)
-        state = {name: read(getattr(now, name)[:count]) for name in ("stock", "in_play", "row", "col")}
-        image = self._panels.joined(boards(self._scene, state), UNSEEN)
-        turns = read(now.step[:count])[:, 0].tolist()
-        word = "turn " if count <= _LABELLED else ""  # more labels would stand on each other
+        state = {name: read(getattr(worlds, name)[:count]) for name in ("stock", "in_play", "row", "col")}
+        image = self._panels.join(boards(self._scene, state), UNSEEN)
+        turns = read(worlds.step[:count])[:, 0].tolist()
+        word = "turn " if count <= _LABELLED else ""
         labels = [f"{board}: {word}{turn}" for board, turn in enumerate(turns)]
         colours = np.where(self._died[:, None], DIED, TEXT).astype(np.uint8)
-        return self._logger.step, self._logger.episode, frame, image, labels, colours
+        return _WallRow(self._logger.step, self._logger.episode, frame, image, labels, colours)
 
-    def _log(self, rows: Sequence[_Row], *, live_only: bool = False) -> None:
+    def _log(self, rows: Sequence[_WallRow], *, live_only: bool = False) -> None:
         steps, episodes, frames, images, labels, colours = zip(*rows, strict=True)
         texts = rr.Points2D.columns(labels=list(chain(*labels)), colors=np.concatenate(colours))
-        parts = {
+        columns_by_entity = {
             "wall/boards": rr.SegmentationImage.columns(buffer=np.stack(images).reshape(len(rows), -1)),
             "wall/labels": texts.partition([len(self._died)] * len(rows)),
         }
-        for entity, columns in parts.items():
+        for entity, columns in columns_by_entity.items():
             self._logger.log_columns(entity, (steps, episodes, frames), columns, live_only=live_only)

@@ -1,4 +1,4 @@
-"""The streams of one recording, to a file and to viewers: each may fail without harm to the run."""
+"""Where a recording goes: to a file and to live viewers. Each stream may fail without harm to the run."""
 
 import atexit
 import os
@@ -8,6 +8,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cache, partial
 from operator import methodcaller
 from pathlib import Path
@@ -18,7 +19,7 @@ from typing import Any, Final, TypeAlias
 import rerun as rr
 from rerun.chunk import RrdReader
 
-from cprl.system.compat import StoredLayout, keep_native
+from cprl.system.compat.recordings import StoredLayout, keep_native
 from cprl.system.output import legible
 from cprl.values import checked
 from cprl.viewer.names import HEADER
@@ -29,38 +30,47 @@ STALL_S: Final = 2.0
 CLOSE_S: Final = 5.0
 """Seconds within which a viewer must take the last data when a run ends, and when the interpreter exits."""
 QUEUED_CALLS: Final = 256
-"""Calls that wait for a viewer; the frames of about thirty episodes."""
+"""The length of the queue of calls to a viewer: the frames of about thirty episodes."""
 FLUSH_TIMEOUT_S: Final = 5.0
+"""Seconds that a flush of a recording may take."""
 
-RUN, REPLAY = "cprl", "cprl replay"
-"""The application ids of runs and of replays: a viewer keeps one layout for each. Recordings of a run that is
-resumed must have that of its first one."""
-SERVER_MEMORY: Final = "512MB"
-"""The memory limit of the served recording; beyond it viewers lose the oldest rows, the file does not."""
-EXHIBITION_MEMORY: Final = "1MB"
-"""The same of the exhibition, of which viewers need the newest frame alone."""
-FILES_MEMORY: Final = "75%"
-"""The same of recordings that are served from their files: all of them, while memory lasts."""
-NEEDED_BYTES: Final = 2_000_000
-"""The free disk space needed to start a recording; its layout and static parts take a tenth."""
+RUN_APPLICATION: Final = "cprl"
+"""The application id of a training's recordings. A viewer keeps one layout for each id, and all recordings of
+a resumed run must have the same id."""
+REPLAY_APPLICATION: Final = "cprl replay"
+"""The application id of recordings in which a stored policy plays."""
+_SERVER_MEMORY: Final = "512MB"
+"""The memory limit of the served recording. Beyond it viewers lose the oldest rows; the file keeps them."""
+_EXHIBITION_MEMORY: Final = "1MB"
+"""The memory limit of the exhibition: viewers need only its newest frame."""
+_FILES_MEMORY: Final = "75%"
+"""The memory limit of a server that serves recordings from files, as a share of the machine's memory."""
+_NEEDED_BYTES: Final = 2_000_000
+"""The free disk space needed to start a recording. Its layout and static parts take a tenth of it."""
 
 HISTORY_S: Final = 60.0
-"""The age of a live recording from which browsers may take a while to read it."""
+"""The age in seconds from which a live recording is so long that browsers take a while to read it."""
 LOADING_S: Final = 20.0
-"""Seconds from when a browser opens the page until it reads the recording, about."""
+"""About how many seconds a browser takes to read the history after it has opened the page."""
 
 _STALLED: Final[list[Any]] = []
-"""Recordings whose viewers do not answer: the end of the last reference to one would wait for them."""
+"""Recordings whose viewers do not answer, kept alive: freeing one would wait for its viewer."""
 
-Row: TypeAlias = tuple[int, int, int, list[float] | str]
-"""Step, episode, frame, and a number for each line or a Markdown text."""
+BufferedRow: TypeAlias = tuple[int, int, int, list[float] | str]
+"""The step, the episode and the frame of a row, and its value: a number for each line, or a Markdown text."""
 
 
 class Stream:
-    """One recording stream. If it fails, it warns once, and the run continues without it."""
+    """A recording on its way to a file. If it fails, it warns once, and the run continues without it.
+
+    Args:
+        name: what warnings call the stream.
+        recording: the `rerun.RecordingStream`.
+        period_s: the seconds between two sends of buffered rows.
+    """
 
     is_live = False
-    """Whether it is sent to viewers."""
+    """Whether the stream leads to viewers."""
 
     def __init__(self, name: str, recording: Any, *, period_s: float) -> None:
         self.name = name
@@ -68,35 +78,37 @@ class Stream:
         self.period_s = period_s
         self.is_open = True
         self.has_failed = False
-        self.waiting: dict[str, list[Row]] = {}
+        self.buffer: dict[str, list[BufferedRow]] = {}
         """Numbers and texts that have not been sent, by entity."""
-        self._sent = time.perf_counter()
+        self._last_sent = time.perf_counter()
 
     @property
     def is_due(self) -> bool:
-        return time.perf_counter() - self._sent > self.period_s
+        """Return whether the period since the last send is over."""
+        return time.perf_counter() - self._last_sent > self.period_s
 
-    def take(self) -> dict[str, list[Row]]:
-        """Return the buffered numbers; the buffer is empty afterwards."""
-        taken = self.waiting
-        self.waiting = {}
-        self._sent = time.perf_counter()
-        return taken
+    def take_buffer(self) -> dict[str, list[BufferedRow]]:
+        """Empty the buffer and return the rows that it held."""
+        rows = self.buffer
+        self.buffer = {}
+        self._last_sent = time.perf_counter()
+        return rows
 
-    def do(self, what: Callable[[Any], object]) -> None:
+    def call(self, function: Callable[[Any], object]) -> None:
         """Call a function with the recording, unless the stream has failed or is closed."""
         if self.is_open:
-            self._try(partial(self._call, what))
+            self._try(partial(self._call, function))
 
     def close(self) -> None:
-        """Disconnects; the file gets its footer. A second call does nothing."""
+        """Disconnect; the file gets its footer. A second call does nothing."""
         if self.is_open:
             self._try(self._disconnect)
             self.is_open = False
 
-    def _try(self, what: Callable[[], object]) -> None:
+    def _try(self, action: Callable[[], object]) -> None:
+        """Do something with the stream; if it raises, close the stream and warn."""
         try:
-            what()
+            action()
         except Exception as error:
             self.is_open = False
             self.has_failed = True
@@ -108,19 +120,21 @@ class Stream:
                 stacklevel=5,
             )
 
-    def _call(self, what: Callable[[Any], object]) -> None:
-        what(self.recording)
+    def _call(self, function: Callable[[Any], object]) -> None:
+        function(self.recording)
 
     def _disconnect(self) -> None:
         self.recording.disconnect()
 
 
 class LiveStream(Stream):
-    """A stream to viewers. Its calls are made in a thread of its own, because a viewer that stands still, or
-    accepts a connection and never reads, makes them wait for half a minute.
+    """A recording on its way to viewers, served by Rerun.
+
+    Functions are called with it in a separate thread: a viewer that hangs, or connects and never reads, would
+    make the training wait for half a minute.
 
     Args:
-        history_s: the age from which browsers that open it read in its header that history loads.
+        history_s: the age in seconds from which the header tells browsers that they are loading the history.
     """
 
     is_live = True
@@ -128,7 +142,7 @@ class LiveStream(Stream):
     def __init__(self, name: str, recording: Any, *, period_s: float, history_s: float = HISTORY_S) -> None:
         super().__init__(name, recording, period_s=period_s)
         self._header = ""
-        self._loading = 0
+        self._loading_browsers = 0
         self._has_history_from = time.perf_counter() + history_s
         self._queue: Queue[Callable[[Any], object] | None] = Queue(QUEUED_CALLS)
         self._error: Exception | None = None
@@ -137,59 +151,62 @@ class LiveStream(Stream):
 
     @property
     def is_behind(self) -> bool:
-        """Whether calls wait that viewers have not taken, so that what can be left out should be."""
+        """Return whether a viewer has not yet taken earlier data, so that dispensable frames should be left
+        out."""
         return self._queue.qsize() > 1
 
-    def say(self, recording: Any, name: str, text: str) -> None:
-        """Send a Markdown text without a time, which takes the place of the one before at all times; to be
-        called with `do`.
+    def send_text(self, recording: Any, name: str, text: str) -> None:
+        """Send a Markdown text without a time, which replaces the earlier one at every step.
 
-        A server sends it before the history, so who connects late never reads an old one as the present.
+        Call it through `call`. The server sends such a text before the history, so a viewer that connects
+        late never shows an old text as the present.
         """
         if name == HEADER:
             self._header = text
-            mark, _, words = text.partition(" ")
-            text = f"{mark} History loads · {words}" if self._loading else text
+            if self._loading_browsers:
+                text = text.replace(" ", " History loads · ", 1)
         recording.send_columns(name, [], rr.TextDocument.columns(text=[text]))
 
-    def opened(self) -> None:
-        """Note that a browser has opened the page. It reads the newest header first, then the history, then
-        what is sent from now on: the header says that history loads until it is sent again."""
+    def show_loading(self) -> None:
+        """Say in the header that the history loads, for as long as a browser that opens the page needs.
+
+        The browser reads the newest header first, then the history, then what is sent from now on.
+        """
         if time.perf_counter() < self._has_history_from:
             return
-
-        def load(recording: Any, change: int) -> None:
-            self._loading += change
-            if self._header:
-                self.say(recording, HEADER, self._header)
-
-        self.do(partial(load, change=1))
-        loaded = Timer(LOADING_S, self.do, [partial(load, change=-1)])
+        self.call(partial(self._count_loading_browsers, change=1))
+        loaded = Timer(LOADING_S, self.call, [partial(self._count_loading_browsers, change=-1)])
         loaded.daemon = True
         loaded.start()
 
-    def _call(self, what: Callable[[Any], object] | None) -> None:
+    def _count_loading_browsers(self, recording: Any, change: int) -> None:
+        self._loading_browsers += change
+        if self._header:
+            self.send_text(recording, HEADER, self._header)
+
+    def _call(self, function: Callable[[Any], object] | None) -> None:
+        """Put a function into the queue of the thread; None ends the thread."""
         if self._error is not None:
             raise self._error
         try:
-            self._queue.put(what, timeout=STALL_S)
+            self._queue.put(function, timeout=STALL_S)
         except Full:
             raise TimeoutError(f"it has taken no data for {STALL_S:g} s and the queue is full") from None
 
     def _disconnect(self) -> None:
-        ends = time.monotonic() + CLOSE_S
+        deadline = time.monotonic() + CLOSE_S
         self._call(lambda recording: recording.disconnect())
         self._call(None)
-        self._thread.join(max(0.0, ends - time.monotonic()))
+        self._thread.join(max(0.0, deadline - time.monotonic()))
         if self._error is not None:
             raise self._error
         if self._thread.is_alive():
             raise TimeoutError(f"it has not taken the last data within {CLOSE_S:g} s")
 
     def _work(self) -> None:
-        while (what := self._queue.get()) is not None:
+        while (function := self._queue.get()) is not None:
             try:
-                what(self.recording)
+                function(self.recording)
             except Exception as error:
                 self._error = error
                 return
@@ -197,14 +214,15 @@ class LiveStream(Stream):
 
 @cache
 def exit_in_time() -> None:
-    """Give Rerun's own last flush, when the interpreter exits, a deadline; it has none of itself."""
+    """Set a deadline for Rerun's last flush when the interpreter exits; by default it has none."""
 
     def shut_down() -> None:
+        deadline_s = STALL_S if _STALLED else CLOSE_S
         flush = Thread(target=rr.rerun_shutdown, daemon=True)
         flush.start()
-        flush.join(STALL_S if _STALLED else CLOSE_S)
+        flush.join(deadline_s)
         if _STALLED or flush.is_alive():
-            # A flush that waits holds a lock, for which the end of any other recording would wait.
+            # A flush that hangs holds a lock, and freeing any other recording would wait for that lock.
             rr.RecordingStream.__del__ = keep_native  # type: ignore[method-assign]
 
     rr.unregister_shutdown()
@@ -212,13 +230,14 @@ def exit_in_time() -> None:
 
 
 class Live:
-    """What viewers of a run are sent, served on free ports of 127.0.0.1; they can connect at any time and get
-    the history.
+    """The live recording of a run, served on free ports of 127.0.0.1.
+
+    Viewers can connect at any time; they get the history first.
 
     Args:
         mode: "serve", or "spawn" to start Rerun's native viewer as well.
-        exhibits: whether there is an exhibition, which has a server of its own, since a server that has used
-            its memory drops the oldest rows of all.
+        exhibits: whether to serve an exhibition too. It has a server of its own, because a server that
+            reaches its memory limit drops the oldest rows, whatever they belong to.
     """
 
     def __init__(
@@ -228,26 +247,26 @@ class Live:
         blueprint: Any,
         *,
         period_s: float,
-        application: str = RUN,
+        application: str = RUN_APPLICATION,
         exhibits: bool = False,
     ) -> None:
         checked("live", mode, Served)
         exit_in_time()
 
         def serve(name: str, memory: str, *, send_properties: bool) -> LiveStream:
-            recording = _recording(application, recording_id, send_properties=send_properties)
-            # The layout is in both: a viewer may hear of the recording from either first.
+            recording = _new_recording(application, recording_id, send_properties=send_properties)
+            # Both servers send the layout: a viewer may connect to either first.
             sources.append(_serve(recording, memory, blueprint))
             return LiveStream(name, recording, period_s=period_s)
 
         sources: list[str] = []
-        self.stream = serve("live view", SERVER_MEMORY, send_properties=True)
+        self.stream = serve("live view", _SERVER_MEMORY, send_properties=True)
         self.exhibition: LiveStream | None = None
         if exhibits:
-            self.exhibition = serve("exhibition", EXHIBITION_MEMORY, send_properties=False)
+            self.exhibition = serve("exhibition", _EXHIBITION_MEMORY, send_properties=False)
         if mode == "spawn":
             _spawn(sources)
-        self._page = WebViewer(*sources, opened=self.stream.opened)
+        self._page = WebViewer(*sources, opened=self.stream.show_loading)
         self.addresses = self._page.addresses
 
     def close(self) -> None:
@@ -258,20 +277,22 @@ class Live:
 
 
 def open_file(
-    recording_id: str, path: Path, blueprint: Any, *, period_s: float, application: str = RUN
+    recording_id: str, path: Path, blueprint: Any, *, period_s: float, application: str = RUN_APPLICATION
 ) -> Stream | None:
-    """Return a stream to a new file; None, with a warning, if the disk is almost full.
+    """Return a stream to a new file; warn and return None if the disk is almost full.
 
-    Otherwise Rerun may wait forever for the layout to be written.
+    On a full disk Rerun may wait forever for the layout to be written.
     """
     free = shutil.disk_usage(path.parent).free
-    if free < NEEDED_BYTES:
-        _warn_of(f"file {path}", f"{free:,} bytes are free there, {NEEDED_BYTES:,} are needed")
+    if free < _NEEDED_BYTES:
+        _warn_that_run_continues(
+            f"file {path}", f"{free:,} bytes are free there, {_NEEDED_BYTES:,} are needed"
+        )
         return None
-    recording = _recording(application, recording_id)
+    recording = _new_recording(application, recording_id)
     try:
         recording.save(path, default_blueprint=blueprint)
-    except UnicodeEncodeError:  # Rerun takes no folder whose name is not in UTF-8
+    except UnicodeEncodeError:  # Rerun refuses folders whose name is not UTF-8; a descriptor's path is
         folder = os.open(path.parent, os.O_RDONLY)
         recording.save(f"/proc/self/fd/{folder}/{path.name}", default_blueprint=blueprint)
         os.close(folder)
@@ -288,69 +309,93 @@ def _serve(recording: Any, memory: str, blueprint: Any = None) -> str:
 
 @contextmanager
 def served(files: Sequence[Path]) -> Iterator[WebViewer]:
-    """Serve recordings within the block. (Rerun's own command keeps a core busy as long as it serves a file.)
+    """Serve recordings from their files within the block.
 
-    Viewers get the layout first, else they make one of their own; then the newest header as static data:
-    while they load the history they would show old ones as the present.
+    Rerun's own command would keep a core busy for as long as it serves a file. Viewers get the layout first,
+    else they would make one of their own; then the newest header without a time, else they would show old
+    headers as the present while they load the history.
     """
     exit_in_time()
-    recordings = []
-    readers = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the recording of a run that was killed has no footer
-        for path in files:
-            with suppress(RuntimeError):
-                reader = RrdReader(path)  # fails where it is none
-                recordings.append(path)
-                reader.recordings()  # fails where it is cut; viewers get what is before that
-                readers.append(reader)
-        if not recordings:
-            raise ValueError(f"no recording can be read of {', '.join(map(str, files))}")
-        # Without one that is whole: a name of its own leaves viewers of "cprl" the layout in the file.
-        application = "cut"
-        recording_id = "cut"
-        header = None
-        layout = None
-        if readers:
-            reader, header = _newest_header(readers)
-            store = reader.recordings()[0]
-            application = store.application_id
-            recording_id = store.recording_id
-            layout = next((StoredLayout(reader.stream(store=stored)) for stored in reader.blueprints()), None)
-    recording = _recording(application, recording_id, send_properties=False)
-    source = _serve(recording, FILES_MEMORY, layout)
+    contents = _read_files(files)
+    recording = _new_recording(contents.application, contents.recording_id, send_properties=False)
+    source = _serve(recording, _FILES_MEMORY, contents.layout)
     stream = LiveStream("recording", recording, period_s=0.0, history_s=0.0)
-    page = WebViewer(source, opened=stream.opened)
+    page = WebViewer(source, opened=stream.show_loading)
     try:
-        if header is not None:
-            stream.do(partial(stream.say, name=HEADER, text=header))
-        for path in recordings:
-            stream.do(methodcaller("log_file_from_path", path))
+        if contents.header is not None:
+            stream.call(partial(stream.send_text, name=HEADER, text=contents.header))
+        for path in contents.readable_files:
+            stream.call(methodcaller("log_file_from_path", path))
         yield page
     finally:
         page.close()
         stream.close()
 
 
+@dataclass
+class _FileContents:
+    """What the server of some recording files needs to know about them."""
+
+    readable_files: list[Path]
+    application: str = "cut"
+    """The application id. Files that break off have one that differs from that of runs, so that the layout
+    which a viewer keeps for runs stays as it is."""
+    recording_id: str = "cut"
+    header: str | None = None
+    """The newest header, a Markdown text."""
+    layout: StoredLayout | None = None
+
+
+def _read_files(files: Sequence[Path]) -> _FileContents:
+    """Return the ids, the newest header and the layout of recordings; leave out files that are no recordings.
+
+    Raises:
+        ValueError: if no file is a recording.
+    """
+    readable_files = []
+    complete = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the recording of a run that was killed has no footer
+        for path in files:
+            with suppress(RuntimeError):
+                reader = RrdReader(path)  # raises if the file is no recording
+                readable_files.append(path)
+                reader.recordings()  # raises if the file breaks off; viewers get the part before the break
+                complete.append(reader)
+        if not readable_files:
+            raise ValueError(f"no recording can be read of {', '.join(map(str, files))}")
+        contents = _FileContents(readable_files)
+        if complete:
+            newest, contents.header = _newest_header(complete)
+            store = newest.recordings()[0]
+            contents.application = store.application_id
+            contents.recording_id = store.recording_id
+            for blueprint in newest.blueprints()[:1]:
+                contents.layout = StoredLayout(newest.stream(store=blueprint))
+    return contents
+
+
 def _newest_header(readers: Sequence[RrdReader]) -> tuple[RrdReader, str | None]:
-    """Return the recording that has the newest header, and the header; None if none has one."""
-    step = -1
-    header = None
-    newest = readers[0]
+    """Return the recording that has the newest header, and this header; None if no recording has one."""
+    newest_step = -1
+    newest_header = None
+    newest_reader = readers[0]
     for reader in readers:
         for chunk in reader.stream().filter(content=f"/{HEADER}"):
             batch = chunk.to_record_batch()
-            if "step" in batch.schema.names and batch["step"][-1].as_py() >= step:
-                step = batch["step"][-1].as_py()
-                header = batch["TextDocument:text"][-1].as_py()[0]
-                newest = reader
-    return newest, header
+            if "step" in batch.schema.names and batch["step"][-1].as_py() >= newest_step:
+                newest_step = batch["step"][-1].as_py()
+                newest_header = batch["TextDocument:text"][-1].as_py()[0]
+                newest_reader = reader
+    return newest_reader, newest_header
 
 
 def _spawn(sources: list[str]) -> None:
     """Start Rerun's native viewer in its own process; warn if it cannot open."""
     if not has_display():
-        _warn_of("viewer cannot open", "there is no display; open one of the addresses from elsewhere")
+        _warn_that_run_continues(
+            "viewer cannot open", "there is no display; open one of the addresses from elsewhere"
+        )
         return
     try:
         subprocess.Popen(
@@ -360,19 +405,21 @@ def _spawn(sources: list[str]) -> None:
             start_new_session=True,
         )
     except OSError as error:
-        _warn_of("viewer cannot be started", error)
+        _warn_that_run_continues("viewer cannot be started", error)
 
 
-def _warn_of(what: str, why: object) -> None:
-    warnings.warn(f"the Rerun {what}: {why}; the run continues without it", RuntimeWarning, stacklevel=3)
+def _warn_that_run_continues(failure: str, reason: object) -> None:
+    warnings.warn(
+        f"the Rerun {failure}: {reason}; the run continues without it", RuntimeWarning, stacklevel=3
+    )
 
 
-def _recording(application: str, recording_id: str, *, send_properties: bool = True) -> Any:
+def _new_recording(application: str, recording_id: str, *, send_properties: bool = True) -> Any:
     recording = rr.RecordingStream(
         application,
         recording_id=legible(recording_id),
         send_properties=send_properties,
-        batcher_config=rr.ChunkBatcherConfig(flush_num_rows=1),  # columns would overtake rows that wait
+        batcher_config=rr.ChunkBatcherConfig(flush_num_rows=1),  # else columns overtake rows in Rerun's batch
     )
     recording.set_log_time_enabled(False)
     return recording

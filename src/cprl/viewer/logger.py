@@ -1,4 +1,4 @@
-"""RerunLogger: records a run with Rerun, to a file and, on request, live on 127.0.0.1."""
+"""RerunLogger: records a run for the Rerun viewer, in a file and, on request, live on 127.0.0.1."""
 
 import json
 import time
@@ -18,125 +18,147 @@ from torchrl.record.loggers import Logger
 
 from cprl.runs.files import read_json
 from cprl.runs.recipe import RECIPE_FILE
-from cprl.system.compat import end_recordings
+from cprl.system.compat.recordings import end_recordings
 from cprl.system.output import console, legible
-from cprl.values import shown
-from cprl.viewer.board import Frames, columns
-from cprl.viewer.layout import fixed, layout
-from cprl.viewer.live import FLUSH_TIMEOUT_S, REPLAY, RUN, Live, LiveStream, Stream, open_file
-from cprl.viewer.page import FILE_NAME
+from cprl.values import short_repr
+from cprl.viewer.board import Frames, frame_columns
+from cprl.viewer.layout import layout, static_parts
+from cprl.viewer.live import (
+    FLUSH_TIMEOUT_S,
+    REPLAY_APPLICATION,
+    RUN_APPLICATION,
+    BufferedRow,
+    Live,
+    LiveStream,
+    Stream,
+    open_file,
+)
+from cprl.viewer.page import RECORDING_FILE
 from cprl.viewer.scene import Curves, Scene
 
-TIMELINES: Final = ("step", "episode", "frame")
+_TIMELINES: Final = ("step", "episode", "frame")
 """The timelines of every row: environment steps of the run, episodes, and frames recorded so far."""
 
 _LIVE_PERIOD_S: Final = 4.0
-"""Sending a dozen numbers takes some ten milliseconds, in which a training waits for Python's lock."""
+"""Seconds between two sends to viewers. A send takes about 10 ms, during which the training waits for
+Python's global lock."""
 _FILE_PERIOD_S: Final = 60.0
-"""Each batch of numbers adds about forty kilobytes to the file, however few they are."""
-_LONGEST: Final = 90
-"""Characters of a value in the table; the recipe of the run has them all."""
+"""Seconds between two writes to the file. Each write adds about 40 kB, even for few numbers."""
+_LONGEST_VALUE: Final = 90
+"""The longest text of a value in the recipe's table, in characters; recipe.json has the whole text."""
 
-Numbers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
+_Integers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
+RowTimes: TypeAlias = tuple[_Integers, _Integers, _Integers]
+"""The steps, the episodes and the frames of some rows: one number per row on each timeline."""
 
 
 def recording_id(run: Path, file_name: str) -> str | None:
-    """Return the id of a recording, the same when a run is resumed or extended; None without a run."""
+    """Return the id of a run's recording, which stays the same when the run is resumed or extended.
+
+    Return None if the directory holds no run.
+    """
     if not (run / RECIPE_FILE).exists():
         return None
     recipe = read_json(run / RECIPE_FILE)
-    same = {name: value for name, value in recipe.items() if name not in ("experiment", "extended")}
-    return str(uuid.uuid5(uuid.NAMESPACE_URL, file_name + json.dumps(same, sort_keys=True)))
+    unchanging = {name: value for name, value in recipe.items() if name not in ("experiment", "extended")}
+    return str(uuid.uuid5(uuid.NAMESPACE_URL, file_name + json.dumps(unchanging, sort_keys=True)))
 
 
-def as_table(recipe: Mapping[Any, Any]) -> str:
-    """Return a recipe as a table; texts of several lines, such as drawn boards, stand below it as they are.
+def recipe_table(recipe: Mapping[Any, Any]) -> str:
+    """Return a recipe as a Markdown table with one row per value, such as `| rules.beam_length_cells | 10 |`.
 
-    An entry of a list that equals the first is one row that says so.
+    Texts of several lines, such as drawn boards, follow below the table. An entry of a list that equals the
+    first entry is one row that refers to the first.
     """
     rows = []
-    texts = []
-    for place, value in _places(recipe, ""):
+    long_texts = []
+    for path, value in _values_by_path(recipe, ""):
         if isinstance(value, str) and "\n" in value:
-            texts.append(f"`{place}`\n\n```\n{value}\n```")
-        else:
-            rows.append(f"| {_cell(place)} | {_cell(_short(value))} |")
-    return "\n\n".join(["\n".join(["| place | value |", "| --- | --- |", *rows]), *texts])
+            long_texts.append(f"`{path}`\n\n```\n{value}\n```")
+            continue
+        text = value if isinstance(value, str) else short_repr(value)
+        if len(text) > _LONGEST_VALUE:
+            text = f"{text[:_LONGEST_VALUE]} ..."
+        rows.append(f"| {_table_cell(path)} | {_table_cell(text)} |")
+    return "\n\n".join(["\n".join(["| place | value |", "| --- | --- |", *rows]), *long_texts])
 
 
-def _places(value: Any, place: str) -> Iterator[tuple[str, Any]]:
-    """Each value that holds no others, with its dotted place."""
+def _values_by_path(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield each value that holds no other values, with its dotted path: {"a": {"b": 1}} yields "a.b", 1."""
     if isinstance(value, Mapping) and value:
         for name, entry in value.items():
-            yield from _places(entry, f"{place}.{name}" if place else str(name))
+            yield from _values_by_path(entry, f"{path}.{name}".removeprefix("."))
     elif isinstance(value, list | tuple) and any(isinstance(entry, Mapping) for entry in value):
         for index, entry in enumerate(value):
             if index and entry == value[0]:
-                yield f"{place}.{index}", f"as {place}.0"
+                yield f"{path}.{index}", f"as {path}.0"
             else:
-                yield from _places(entry, f"{place}.{index}")
+                yield from _values_by_path(entry, f"{path}.{index}")
     else:
-        yield place, value
+        yield path, value
 
 
-def _short(value: Any) -> str:
-    text = value if isinstance(value, str) else shown(value)
-    return text if len(text) <= _LONGEST else f"{text[:_LONGEST]} ..."
-
-
-def _cell(text: str) -> str:
+def _table_cell(text: str) -> str:
     return text.replace("|", "\\|").replace("\n", " ")
 
 
-def times(steps: Numbers, episodes: Numbers, frames: Numbers) -> list[Any]:
-    """Return the timelines of each row."""
+def _time_columns(times: RowTimes) -> list[Any]:
+    """Return Rerun's column of each timeline."""
     return [
-        rr.TimeColumn(name, sequence=np.asarray(numbers, np.int64))
-        for name, numbers in zip(TIMELINES, (steps, episodes, frames), strict=True)
+        rr.TimeColumn(timeline, sequence=np.asarray(numbers, np.int64))
+        for timeline, numbers in zip(_TIMELINES, times, strict=True)
     ]
 
 
-def send_waiting(stream: Stream) -> None:
+def send_buffer(stream: Stream) -> None:
     """Send the buffered numbers and texts of one stream, one chunk per entity.
 
-    Of texts viewers get the newest alone, by `LiveStream.say`. Files keep each with its time: of static texts
-    in several files of one recording a viewer shows the one that it loads last.
+    A viewer gets only the newest text, without a time, see `LiveStream.send_text`. A file keeps each text
+    with its time: if several files of one recording had a text without a time, the viewer would show the one
+    that it loads last.
     """
-    waiting = stream.take()
+    stream.call(partial(_send_rows, stream, stream.take_buffer()))
 
-    def send(recording: Any) -> None:
-        known: dict[Any, list[Any]] = {}  # most names have the same times
-        for name, rows in waiting.items():
-            *at, values = zip(*rows, strict=True)
-            if isinstance(stream, LiveStream) and isinstance(values[-1], str):
-                stream.say(recording, name, values[-1])
-                continue
-            if tuple(at) not in known:
-                known[tuple(at)] = times(*at)
-            if isinstance(values[0], str):
-                what: Any = rr.TextDocument.columns(text=list(values))
-            else:
-                lines = [len(line) for line in values]
-                what = rr.Scalars.columns(scalars=np.concatenate(values)).partition(lines)
-            recording.send_columns(name, known[tuple(at)], what)
-        recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
 
-    stream.do(send)
+def _send_rows(stream: Stream, rows_by_entity: Mapping[str, Sequence[BufferedRow]], recording: Any) -> None:
+    time_columns: dict[Any, list[Any]] = {}  # by the times of the rows, which most entities share
+    for entity, rows in rows_by_entity.items():
+        steps, episodes, frames, values = zip(*rows, strict=True)
+        if isinstance(stream, LiveStream) and isinstance(values[-1], str):
+            stream.send_text(recording, entity, values[-1])
+            continue
+        times = (steps, episodes, frames)
+        if times not in time_columns:
+            time_columns[times] = _time_columns(times)
+        columns = _text_columns(values) if isinstance(values[0], str) else _line_columns(values)
+        recording.send_columns(entity, time_columns[times], columns)
+    recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
+
+
+def _text_columns(texts: Sequence[str]) -> Any:
+    return rr.TextDocument.columns(text=list(texts))
+
+
+def _line_columns(rows: Sequence[Sequence[float]]) -> Any:
+    """Return the columns of plotted lines: in each row one number per line."""
+    line_counts = list(map(len, rows))
+    return rr.Scalars.columns(scalars=np.concatenate(rows)).partition(line_counts)
 
 
 class RerunLogger(Logger):
-    """A TorchRL logger that writes a Rerun recording; names become entities, `social/equality` and so on.
+    """A TorchRL logger that writes a Rerun recording. A logged name becomes an entity: `social/equality`.
 
     Numbers are buffered in memory and sent as columns: to viewers about every four seconds, to the file about
     every minute. Every row carries the timelines `step` (environment steps of the run), `episode` and `frame`
     (frames recorded so far). The file and the live recording are two streams with the same recording id. If
-    one fails, the logger warns once, drops it and continues with the other.
+    one stream fails, the logger warns once, drops it and continues with the other.
 
     Args:
-        curves: the numbers that are plotted; a `Scene` if there is a board.
-        live: "serve" or "spawn", see `cprl.viewer.live.Live`; None for the file alone. The recording and the
-            page of the web viewer are served on 127.0.0.1 only.
-        exhibits: whether viewers are sent an exhibition too, see `cprl.viewer.exhibition`.
+        curves: the numbers that are plotted; a `Scene` if the recording shows a board.
+        live: "serve" or "spawn", see `cprl.viewer.live.Live`; None writes the file only. The recording and
+            the page of the web viewer are served on 127.0.0.1 only.
+        exhibits: whether viewers also get an exhibition, see `cprl.experimental.exhibition`.
+        file_name: the name of the file in `log_dir`.
         recording_id: the viewer shows files with the same id as one recording; by default a new id.
 
     Raises:
@@ -151,7 +173,7 @@ class RerunLogger(Logger):
         curves: Curves | None = None,
         live: str | None = None,
         exhibits: bool = False,
-        file_name: str = FILE_NAME,
+        file_name: str = RECORDING_FILE,
         recording_id: str | None = None,
     ) -> None:
         self.curves = curves or Curves(agents=())
@@ -162,20 +184,23 @@ class RerunLogger(Logger):
                 f"{self.path} exists and is not overwritten; use another directory or file_name"
             )
         self.live: Live | None = None
-        """What viewers are sent; None where the recording is written to a file alone."""
-        self._live = live
+        """The served recording; None if the recording is only written to a file."""
+        self._live_mode = live
         self._exhibits = exhibits
         self._streams: list[Stream] = []
         self.frames = 0
         """Frames recorded so far, including those in earlier files of the recording."""
         self.step = self.episode = 0
-        """The time of what is logged; see `at`."""
-        self._clips_end: dict[str, int] = {}
+        """The step and the episode of the rows that are logged next; see `set_time`."""
+        self._video_ends: dict[str, int] = {}
+        """The step after the last image of each logged video, by its name."""
         super().__init__(exp_name, str(log_dir))
 
     def _create_experiment(self) -> list[Any]:
         Path(self.log_dir).mkdir(parents=True, exist_ok=True)
-        application = REPLAY if self.scene is not None and self.scene.is_replay else RUN
+        application = RUN_APPLICATION
+        if self.scene is not None and self.scene.is_replay:
+            application = REPLAY_APPLICATION
         file = open_file(
             self.recording_id,
             self.path,
@@ -184,9 +209,9 @@ class RerunLogger(Logger):
             application=application,
         )
         self._streams = [] if file is None else [file]
-        if self._live:
+        if self._live_mode:
             self.live = Live(
-                self._live,
+                self._live_mode,
                 self.recording_id,
                 layout(self.curves, live=True),
                 period_s=_LIVE_PERIOD_S,
@@ -194,39 +219,44 @@ class RerunLogger(Logger):
                 exhibits=self._exhibits,
             )
             self._streams.append(self.live.stream)
-            for where, address in self.addresses.items():
-                console().print(f"Watch live ({where}): {address}", soft_wrap=True, highlight=False)
-        self.do(lambda recording: recording.send_recording_name(self.exp_name))
-        for entity, parts in fixed(self.curves).items():
-            self.log_static(entity, *parts)
-        self.do(lambda recording: recording.flush(timeout_sec=FLUSH_TIMEOUT_S))
+            for viewer, address in self.addresses.items():
+                console().print(f"Watch live ({viewer}): {address}", soft_wrap=True, highlight=False)
+        self.call_on_recordings(lambda recording: recording.send_recording_name(self.exp_name))
+        for entity, archetypes in static_parts(self.curves).items():
+            self.log_static(entity, *archetypes)
+        self.call_on_recordings(lambda recording: recording.flush(timeout_sec=FLUSH_TIMEOUT_S))
         return [stream.recording for stream in self._streams]
 
     @property
     def scene(self) -> Scene | None:
-        """The board that is shown, if there is one."""
+        """Return the curves with the board that is shown; None if the recording shows no board."""
         return self.curves if isinstance(self.curves, Scene) else None
 
     @property
     def addresses(self) -> dict[str, str]:
-        """How to watch live: "browser" and "native"."""
+        """Return the addresses of the live recording for the viewers "browser" and "native"; an empty mapping
+        if the recording is not served."""
         return {} if self.live is None else self.live.addresses
 
     @property
     def is_live(self) -> bool:
-        """Whether viewers can connect: the live stream is open and served."""
+        """Return whether viewers can connect: the live stream is open and served."""
         return self.live is not None and self.live.stream.is_open
 
     @property
     def turn(self) -> int:
-        """The turn of what is logged."""
+        """Return the turn of the rows that are logged next."""
         return self.step // self.curves.worlds
 
-    def do(self, what: Callable[[Any], object], *, live_only: bool = False) -> None:
-        """Call a function with each recording, or with that to viewers alone, in the thread that sends."""
+    def call_on_recordings(self, function: Callable[[Any], object], *, live_only: bool = False) -> None:
+        """Call a function with each `rerun.RecordingStream`; with the live one in the thread that sends.
+
+        Args:
+            live_only: leave out the recording in the file.
+        """
         for stream in self._streams:
             if stream.is_live or not live_only:
-                stream.do(what)
+                stream.call(function)
 
     @contextmanager
     def silent(self) -> Iterator[None]:
@@ -239,113 +269,124 @@ class RerunLogger(Logger):
             self._streams = streams
 
     def send_due(self) -> None:
-        """Send buffered numbers and texts to whom they are due; all that is logged between two calls is sent
-        together, so that it agrees when it is seen."""
+        """Send the buffers of the streams whose period is over.
+
+        Rows logged between two calls are sent together, so that a viewer never shows half an episode.
+        """
         for stream in self._streams:
             if stream.is_due:
-                send_waiting(stream)
+                send_buffer(stream)
 
-    def log_static(self, entity: str, *what: Any) -> None:
-        """Log archetypes that hold at all times."""
-        self.do(lambda recording: recording.log(entity, *what, static=True))
+    def log_static(self, entity: str, *archetypes: Any) -> None:
+        """Log archetypes without a time: they hold at every step."""
+        self.call_on_recordings(lambda recording: recording.log(entity, *archetypes, static=True))
 
-    def log_row(self, name: str, what: Any, *, step: int | None = None, live_only: bool = False) -> None:
-        """Log an archetype at the time set by `at`, or at another step."""
-        at = self.step if step is None else step, self.episode, self.frames
+    def log_row(
+        self, entity: str, archetype: Any, *, step: int | None = None, live_only: bool = False
+    ) -> None:
+        """Log an archetype at the time of `set_time`, or at another step."""
+        row_time = (self._step_or(step), self.episode, self.frames)
 
         def log(recording: Any) -> None:
-            for timeline, number in zip(TIMELINES, at, strict=True):
+            for timeline, number in zip(_TIMELINES, row_time, strict=True):
                 recording.set_time(timeline, sequence=number)
-            recording.log(name, what)
+            recording.log(entity, archetype)
             recording.reset_time()
 
-        self.do(log, live_only=live_only)
+        self.call_on_recordings(log, live_only=live_only)
 
-    def log_columns(
-        self, name: str, at: tuple[Numbers, Numbers, Numbers], what: Any, *, live_only: bool = False
-    ) -> None:
-        """Log rows at steps, episodes and frames of their own."""
-        columns = times(*at)
-        self.do(lambda recording: recording.send_columns(name, columns, what), live_only=live_only)
+    def log_columns(self, entity: str, times: RowTimes, columns: Any, *, live_only: bool = False) -> None:
+        """Log several rows of an entity, each at its step, episode and frame."""
+        time_columns = _time_columns(times)
+        self.call_on_recordings(
+            lambda recording: recording.send_columns(entity, time_columns, columns), live_only=live_only
+        )
 
-    def at(self, *, step: int, episode: int) -> None:
-        """Set the time of subsequent logs that have no step of their own."""
+    def set_time(self, *, step: int, episode: int) -> None:
+        """Set the step and the episode of the rows that are logged from now on."""
         self.step = step
         self.episode = episode
 
+    def _step_or(self, step: int | None) -> int:
+        return self.step if step is None else int(step)
+
     def log_scalar(self, name: str, value: Any, step: int | None = None, **kwargs: Any) -> None:
         """Log a number, or a list, array or tensor of numbers as name/0, name/1 and so on."""
-        numbers = _numbers_in(value)
+        numbers = _flat_array(value)
         for index, number in enumerate(numbers.tolist()):
             entity = name if numbers.size == 1 else f"{name}/{index}"
-            self._wait(entity, self.step if step is None else int(step), [float(number)])
+            self._buffer(entity, self._step_or(step), [float(number)])
         self.send_due()
 
     def log_lines(self, name: str, values: Sequence[float]) -> None:
-        """Log the numbers of several lines of one plot, equally many each time; NaN leaves a gap. They are
-        sent when they are due, see `send_due`."""
-        self._wait(name, self.step, [float(value) for value in values])
+        """Log one number for each line of a plot, in the same order each time; NaN leaves a gap.
+
+        They are sent with the next `send_due`.
+        """
+        self._buffer(name, self.step, [float(value) for value in values])
 
     def log_document(self, name: str, text: str) -> None:
-        """Log a Markdown text in place of the one before, live at all times; it is sent with the numbers."""
-        self._wait(name, self.step, text)
+        """Log a Markdown text, which replaces the earlier one; it is sent with the buffered numbers."""
+        self._buffer(name, self.step, text)
 
     def show_live(self, name: str, text: str) -> None:
-        """`log_document` in the live view alone, and at once; from any thread."""
+        """Show a Markdown text to viewers at once, without writing it to the file; from any thread."""
         for stream in self._streams:
             if isinstance(stream, LiveStream):
-                stream.do(partial(stream.say, name=name, text=text))
+                stream.call(partial(stream.send_text, name=name, text=text))
 
-    def _wait(self, name: str, step: int, values: list[float] | str) -> None:
+    def _buffer(self, name: str, step: int, values: list[float] | str) -> None:
         for stream in self._streams:
-            stream.waiting.setdefault(name, []).append((step, self.episode, self.frames, values))
+            stream.buffer.setdefault(name, []).append((step, self.episode, self.frames, values))
 
     def log_frames(self, frames: Frames) -> None:
-        """Log frames of `FrameRecorder.take`; see `cprl.viewer.board.columns`."""
+        """Log recorded frames, as `cprl.viewer.board.FrameRecorder.take` returns them."""
         if self.scene is None:
             raise ValueError("the logger has no scene; pass a Scene as curves to log frames")
-        numbers = np.arange(self.frames, self.frames + len(frames["step"]))
-        self.frames += len(numbers)
-        for entity, (rows, what) in columns(self.scene, frames).items():
-            self.log_columns(entity, (frames["step"][rows], frames["episode"][rows], numbers[rows]), what)
+        frame_numbers = np.arange(self.frames, self.frames + len(frames["step"]))
+        self.frames += len(frame_numbers)
+        for entity, (rows, columns) in frame_columns(self.scene, frames).items():
+            times = (frames["step"][rows], frames["episode"][rows], frame_numbers[rows])
+            self.log_columns(entity, times, columns)
 
     def log_text(self, text: str) -> None:
         self.log_row("log", rr.TextLog(text, level="INFO"))
 
     def log_hparams(self, cfg: Any) -> None:
-        """Log a mapping, as a table, or a Markdown text, as the recipe of the run."""
-        text = cfg if isinstance(cfg, str) else as_table(dict(cfg))
+        """Log the recipe of the run: a Markdown text, or a mapping that becomes a table."""
+        text = cfg if isinstance(cfg, str) else recipe_table(dict(cfg))
         self.log_static("recipe", rr.TextDocument(legible(text), media_type=rr.MediaType.MARKDOWN))
 
     def log_video(self, name: str, video: Tensor, step: int | None = None, **kwargs: Any) -> None:
-        """Log uint8 [(1), T, C, H, W] as T images at consecutive steps from `step` on.
+        """Log T images, uint8 [T, C, H, W] or [1, T, C, H, W], at consecutive steps from `step` on.
 
-        Starts after the last image of an earlier clip with the same name, because TorchRL's recorders pass
-        the number of the clip as its step.
+        A video starts after the last image of an earlier one with the same name, because TorchRL's recorders
+        pass the number of the video as its step.
         """
-        clip = torch.as_tensor(video).cpu()
-        clip = clip[0] if clip.ndim == 5 else clip
-        if clip.ndim != 4:
+        images = torch.as_tensor(video).cpu()
+        images = images[0] if images.ndim == 5 else images
+        if images.ndim != 4:
             raise ValueError(f"the video is {list(video.shape)}; allowed: [T, C, H, W] or [1, T, C, H, W]")
-        first = max(self.step if step is None else int(step), self._clips_end.get(name, 0))
-        self._clips_end[name] = first + len(clip)
-        for number, image in enumerate(clip.permute(0, 2, 3, 1).to(torch.uint8).numpy(), start=first):
-            self.log_row(name, rr.Image(image), step=number)
+        first_step = max(self._step_or(step), self._video_ends.get(name, 0))
+        self._video_ends[name] = first_step + len(images)
+        channels_last = images.permute(0, 2, 3, 1).to(torch.uint8).numpy()
+        for image_step, image in enumerate(channels_last, start=first_step):
+            self.log_row(name, rr.Image(image), step=image_step)
 
     def log_histogram(
         self, name: str, data: Any, *, bins: int = 30, step: int | None = None, **kwargs: Any
     ) -> None:
         """Log a histogram of values in equal bins, as bars."""
-        counts, edges = np.histogram(_numbers_in(data), bins=bins)
+        counts, edges = np.histogram(_flat_array(data), bins=bins)
         self.log_row(name, rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2), step=step)
 
     def flush(self) -> None:
-        """Send all buffered numbers to the file and to the viewer."""
+        """Send all buffered numbers and texts, to the file and to viewers."""
         for stream in self._streams:
-            send_waiting(stream)
+            send_buffer(stream)
 
     def close_file(self) -> None:
-        """Flush and close the file, which gets its footer; the live stream goes on."""
+        """Flush and close the file, which gets its footer; the live stream stays open."""
         self.flush()
         for stream in self._streams:
             if not stream.is_live:
@@ -357,9 +398,9 @@ class RerunLogger(Logger):
         if self.live is not None:
             self.live.close()
         self.experiment.clear()
-        if not any(stream.has_failed for stream in self._streams):  # the end of one would wait for its viewer
+        if not any(stream.has_failed for stream in self._streams):  # a failed one waits for its viewer to end
             self._streams.clear()
-            with suppress(RuntimeError):  # of an earlier recording that failed, which was reported then
+            with suppress(RuntimeError):  # from an earlier recording that failed and was reported then
                 end_recordings()
 
     close = shutdown
@@ -374,5 +415,8 @@ class RerunLogger(Logger):
         return f"RerunLogger(exp_name={self.exp_name!r}, path={str(self.path)!r}, addresses={self.addresses})"
 
 
-def _numbers_in(data: Any) -> NDArray[Any]:
-    return np.asarray(data.detach().cpu() if isinstance(data, Tensor) else data).reshape(-1)
+def _flat_array(data: Any) -> NDArray[Any]:
+    """Return the numbers of a tensor, an array or a list as an array of one dimension."""
+    if isinstance(data, Tensor):
+        data = data.detach().cpu()
+    return np.asarray(data).reshape(-1)

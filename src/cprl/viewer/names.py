@@ -1,4 +1,4 @@
-"""The names of what a recording holds, and the colours that several parts of it share."""
+"""The names of the entities in a recording, and the colours that several of its parts share."""
 
 from collections.abc import Mapping
 from typing import Final
@@ -9,28 +9,32 @@ from cprl.pictures.colours import BLUE, GREEN, GREY, ORANGE, VERMILION
 from cprl.pictures.decoding import UNSEEN
 
 HEADER: Final = "header"
-"""The entity of the text that people read first."""
-NOW: Final = "now"
-EXPLORING: Final = "exploring"
-"""The entities of states: the live label, and whether agents explore."""
+"""The entity of the header: one line of text above all plots."""
+LABEL_STRIP: Final = "now"
+"""The entity of the live label, a strip that says how the group does, such as "rising"."""
+EXPLORATION_STRIP: Final = "exploring"
+"""The entity of the strip that says whether agents explore."""
 JOINT: Final = "joint_actions"
-"""The lines of the shares of joint actions, in small matrix games."""
-RANDOM_PLAY: Final = "random_play"
+"""The entity of the shares of joint actions, in small matrix games."""
+RANDOM_PLAY_FOLDER: Final = "random_play"
 """The folder of the lines of random play; each has the name of its metric."""
-EVALUATION: Final = "evaluation"
-"""The folder of the lines of evaluations while agents are trained, likewise."""
-PAID, GIVEN = "paid", "given"
-"""The lines of each agent in a replay: what institutions take in a turn, downwards, and give, upwards."""
+EVALUATION_FOLDER: Final = "evaluation"
+"""The folder of the lines of evaluations while agents are trained; each has the name of its metric."""
+PAID: Final = "paid"
+"""The line of what institutions take from an agent in a turn of a replay, downwards."""
+GIVEN: Final = "given"
+"""The line of what institutions give an agent in a turn of a replay, upwards."""
 
 EMPTY_SITE: Final = UNSEEN - 1
 """The class of a site without an apple on boards."""
 TEXT: Final = (200, 200, 200)
-BACKGROUND: Final = (24, 26, 32)
-"""The background of boards and windows, which sets their dark cells apart from the viewer's own colour."""
+"""The colour of texts on boards and plots."""
+BOARD_BACKGROUND: Final = (24, 26, 32)
+"""The background of boards and windows: their dark cells differ from the viewer's background."""
 DIED: Final = VERMILION
-"""The colour of a board that died."""
+"""The colour of a board that died: its last apple was taken before the time was up."""
 SETTLED: Final = "settled"
-"""The state of agents who explore no more, which is not drawn."""
+"""The state of agents that no longer explore, which is not drawn."""
 STATES: Final[Mapping[str, Colour]] = {
     outcome.BEGINS: (80, 80, 80),
     outcome.RISING: GREEN,
@@ -40,6 +44,6 @@ STATES: Final[Mapping[str, Colour]] = {
     outcome.BELOW: VERMILION,
     outcome.DEAD: (140, 40, 0),
     outcome.EXPLORING: (60, 90, 130),
-    SETTLED: BACKGROUND,
+    SETTLED: BOARD_BACKGROUND,
 }
-"""The colours of live labels, and of agents who explore."""
+"""The colours of the live labels, and of the strip that says whether agents explore."""

@@ -1,4 +1,4 @@
-"""How recordings are opened: Rerun's viewers, native and in a browser."""
+"""Rerun's viewers: the native viewer's command, and the web viewer served on 127.0.0.1."""
 
 import itertools
 import os
@@ -11,74 +11,77 @@ from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
 from http import HTTPStatus
-from http.client import HTTPException
+from http.client import HTTPConnection, HTTPException
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from threading import Thread, current_thread, main_thread
 from typing import Any, Final, Literal, get_args
 from urllib.parse import quote
-from urllib.request import ProxyHandler, build_opener
 
-from cprl.system.output import printed
+from cprl.system.output import quote_command
 from cprl.values import checked
 
-FILE_NAME: Final = "run.rrd"
+RECORDING_FILE: Final = "run.rrd"
 LOCALHOST: Final = "127.0.0.1"
 Served = Literal["serve", "spawn"]
+"""The ways to watch a run live: serve it, or serve it and start Rerun's native viewer."""
 
 _QUERY: Final = "renderer=webgl&persist=0&hide_welcome_screen=1&theme=dark"
 _THIS_MACHINE: Final = (
     f"default-src 'self' 'unsafe-inline' 'unsafe-eval' data: blob:; connect-src 'self' http://{LOCALHOST}:*"
 )
-"""Rerun's page would ask other machines for fonts, and tell one of its use."""
-_OPEN: Final = build_opener(ProxyHandler({})).open
-"""Past the proxies of the environment, which do not know the ports of this machine."""
-_PATH: Final = re.compile("/[!-~]*")
-"""What a request may ask for: printed ASCII characters without spaces."""
-_UNTIL_THE_PIPE_CLOSES: Final = '"$@" & read -r _; kill $!'
-"""A shell ends Rerun's server when this process ends, even when it is killed."""
+"""The Content-Security-Policy that forbids a browser to contact other machines."""
+_REQUEST_PATH: Final = re.compile("/[!-~]*")
+"""The paths that requests may have: printed ASCII characters without spaces."""
+_RUN_UNTIL_STDIN_CLOSES: Final = '"$@" & read -r _; kill $!'
+"""A shell script that runs its arguments as a command and ends it when standard input closes: so Rerun's
+server ends with this process, even if this process is killed."""
 
 
 def recordings_of(run: Path) -> list[Path]:
-    """Return the recordings of a run so far, in their order: run.rrd, run-2.rrd and so on; films are none."""
-    names = (FILE_NAME if number == 1 else f"run-{number}.rrd" for number in itertools.count(1))
+    """Return the recordings of a run's training in their order: run.rrd, run-2.rrd and so on."""
+    names = (RECORDING_FILE if number == 1 else f"run-{number}.rrd" for number in itertools.count(1))
     return list(itertools.takewhile(Path.exists, (run / name for name in names)))
 
 
 class WebViewer:
-    """The page at which a browser shows what is served at some addresses, on 127.0.0.1 alone.
+    """The page on which a browser shows served recordings, on 127.0.0.1 only.
 
-    Rerun's own server of its web viewer is a process of its own, which ends with this one. The address of its
-    page names all others, so a server with a short one leads there and hands out what it serves.
+    Rerun's web server runs as a separate process, which ends with this one. Its page would fetch fonts from
+    other machines and send usage data to Rerun's makers, and a browser cannot turn that off. A proxy in this
+    process therefore serves the page with a header that forbids contact with other machines. The proxy also
+    has a short address, which leads to the page that shows all recordings.
 
     Args:
-        opened: called when a browser opens the page, from another thread.
+        sources: the addresses at which the recordings are served.
+        opened: called, in another thread, when a browser opens the page.
     """
 
     def __init__(self, *sources: str, opened: Callable[[], object] = lambda: None) -> None:
-        port = free_port()
+        rerun_port = free_port()
         command = [str(viewer_binary()), "--serve-web", "--bind", LOCALHOST, "--port", str(free_port())]
-        command += ["--web-viewer-port", str(port)]
+        command += ["--web-viewer-port", str(rerun_port)]
         if os.name == "posix":
-            command = ["sh", "-c", _UNTIL_THE_PIPE_CLOSES, "sh", *command]
+            command = ["sh", "-c", _RUN_UNTIL_STDIN_CLOSES, "sh", *command]
         self._process = subprocess.Popen(
             command,
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "CI": "1"},  # without usage data
-            start_new_session=True,  # Ctrl-C is for this process alone
+            env={**os.environ, "CI": "1"},  # Rerun sends no usage data from CI
+            start_new_session=True,  # so that Ctrl-C reaches only this process
         )
-        page = "/?" + "&".join([*(f"url={quote(source, safe='')}" for source in sources), _QUERY])
-        handler = partial(_Page, f"http://{LOCALHOST}:{port}", page, opened)
-        self._server = ThreadingHTTPServer((LOCALHOST, 0), handler)
+        page_path = "/?" + "&".join([*(f"url={quote(source, safe='')}" for source in sources), _QUERY])
+        self._server = ThreadingHTTPServer(
+            (LOCALHOST, 0), partial(_ProxyHandler, rerun_port, page_path, opened)
+        )
         Thread(target=self._server.serve_forever, daemon=True).start()
         self.port = self._server.server_port
         self.addresses = {
             "browser": f"http://{LOCALHOST}:{self.port}/",
-            "native": printed([viewer(), "--connect", *sources]),
+            "native": quote_command([viewer(), "--connect", *sources]),
         }
-        """How to watch, in a browser and in Rerun's native viewer."""
+        """The address for a "browser", and the command line of Rerun's "native" viewer."""
 
     def close(self) -> None:
         """Stop serving. A second call does nothing."""
@@ -91,18 +94,23 @@ class WebViewer:
         self._process.wait()
 
 
-class _Page(BaseHTTPRequestHandler):
-    """Leads to a page of another server, and hands out what that one serves, where it is asked by the name of
-    this machine: a foreign page that has bound its own name to 127.0.0.1 gets nothing."""
+class _ProxyHandler(BaseHTTPRequestHandler):
+    """Redirects "/" to the page of the recordings, and passes other requests on to Rerun's web server.
 
-    def __init__(self, origin: str, page: str, opened: Callable[[], object], *arguments: Any) -> None:
-        self._origin = origin
-        self._page = page
+    A request must name this machine as its host: so a foreign page whose name resolves to 127.0.0.1 gets
+    nothing.
+    """
+
+    def __init__(
+        self, rerun_port: int, page_path: str, opened: Callable[[], object], *arguments: Any
+    ) -> None:
+        self._rerun_port = rerun_port
+        self._page_path = page_path
         self._opened = opened
         super().__init__(*arguments)
 
     def handle(self) -> None:
-        with suppress(ConnectionError):  # a browser that leaves
+        with suppress(ConnectionError):  # the browser left before it had the answer
             super().handle()
 
     def do_GET(self) -> None:
@@ -110,35 +118,43 @@ class _Page(BaseHTTPRequestHandler):
         if self.headers.get("Host") not in (f"{LOCALHOST}:{port}", f"localhost:{port}"):
             self.send_error(HTTPStatus.FORBIDDEN)
             return
-        if not _PATH.fullmatch(self.path):
+        if not _REQUEST_PATH.fullmatch(self.path):
             self.send_error(HTTPStatus.BAD_REQUEST)
             return
         if self.path == "/":
             self.send_response(HTTPStatus.FOUND)
-            self.send_header("Location", self._page)
+            self.send_header("Location", self._page_path)
             self.end_headers()
             return
         if self.path.startswith("/?"):
             self._opened()
+        self._pass_on()
+
+    def _pass_on(self) -> None:
+        """Answer with the content of Rerun's web server, and forbid the page to contact other machines."""
+        rerun = HTTPConnection(LOCALHOST, self._rerun_port)
         try:
-            with _OPEN(self._origin + self.path) as answer:
-                content = answer.read()
-        except (OSError, HTTPException) as error:
-            self.send_error(getattr(error, "code", HTTPStatus.SERVICE_UNAVAILABLE))
+            rerun.request("GET", self.path)
+            answer = rerun.getresponse()
+            content = answer.read()
+        except (OSError, HTTPException):
+            self.send_error(HTTPStatus.SERVICE_UNAVAILABLE)
             return
-        self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", answer.headers["Content-Type"])
+        finally:
+            rerun.close()
+        self.send_response(answer.status)
+        self.send_header("Content-Type", answer.getheader("Content-Type", "text/plain"))
         self.send_header("Content-Length", str(len(content)))
         self.send_header("Content-Security-Policy", _THIS_MACHINE)
         self.end_headers()
         self.wfile.write(content)
 
     def log_message(self, *arguments: Any) -> None:
-        """Say nothing."""
+        """Print no line for each request."""
 
 
 def viewer_binary() -> Path:
-    """Rerun's command itself; the script `rerun` beside Python leaves it running when it is ended."""
+    """Return the path of Rerun's program. Killing the script `rerun` beside Python would leave it running."""
     import rerun_cli
 
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
@@ -146,41 +162,46 @@ def viewer_binary() -> Path:
 
 
 def viewer() -> str:
-    """Return the command of Rerun's native viewer: the one next to this Python, if there is one, else that of
-    the shell, else that of the package, which is neither where packages are installed into a folder of their
-    own."""
-    beside = Path(sys.executable).with_name("rerun")
-    if beside.exists():
-        return str(beside)
+    """Return the command of Rerun's native viewer: the script beside this Python, else the one on the PATH,
+    else the program in Rerun's package."""
+    script = Path(sys.executable).with_name("rerun")
+    if script.exists():
+        return str(script)
     return "rerun" if shutil.which("rerun") else str(viewer_binary())
 
 
 def to_watch(*recordings: Path) -> list[str]:
-    """Return the command line that opens recordings in the native viewer, whatever their names begin with."""
+    """Return the command line that opens recordings in the native viewer."""
+    # A name like "-x.rrd" would be read as an option.
     return [viewer(), *(f"./{path}" if str(path).startswith("-") else str(path) for path in recordings)]
 
 
 def free_port() -> int:
+    """Return the number of a port of 127.0.0.1 that no program uses."""
     with socket.socket() as probe:
         probe.bind((LOCALHOST, 0))
         return int(probe.getsockname()[1])
 
 
 def has_display() -> bool:
+    """Return whether windows can be opened on this machine."""
     if not sys.platform.startswith("linux"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def check_watch(watch: str, *, linger: bool = False, can_be_off: bool = True) -> None:
-    """Check how a run is watched before it starts.
+    """Check how a run is to be watched, before it starts.
 
     Args:
-        watch: "file", or live as well, "serve" or "spawn", see `cprl.viewer.live.Live`; "off" for no
-            recording.
-        linger: whether the recording stays served after the run, which needs signals and something served.
+        watch: "file" to record to a file; "serve" or "spawn" to also show the recording live, see
+            `cprl.viewer.live.Live`; "off" for no recording.
+        linger: whether the recording stays served after the run. That needs a served recording, and the main
+            thread, which waits for the signal to stop.
+        can_be_off: whether "off" is allowed.
     """
-    checked("watch", watch, Literal["file", Served, "off"] if can_be_off else Literal["file", Served])
+    allowed: Any = Literal["file", Served, "off"] if can_be_off else Literal["file", Served]
+    checked("watch", watch, allowed)
     if linger and watch not in get_args(Served):
         raise ValueError(
             f'linger is True, but watch is "{watch}", which serves nothing; allowed: watch "serve" or "spawn"'

@@ -1,4 +1,4 @@
-"""What a recording shows: its numbers, the board if there is one, and where parts of pictures stand."""
+"""The contents of a recording: its numbers, its board, and the positions of boards in joint images."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,89 +15,88 @@ from cprl.commons.game import Game
 from cprl.commons.quirks import self_stays
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import joint_actions
-from cprl.measuring.episodes import decisions_of, metrics_of
 from cprl.measuring.registry import (
+    AGENT_TOTALS,
     COLLECTIVE_RETURN,
     EQUALITY,
     INCOME,
     INSTITUTIONS,
-    OF_AGENTS,
-    SOCIAL,
-    left_out,
+    SOCIAL_METRICS,
+    left_out_note,
 )
-from cprl.values.arrays import Float32
+from cprl.measuring.tracker import decisions_of, metrics_of
+from cprl.values.array_types import Float32
 from cprl.viewer.names import TEXT
 
-MOST_JOINT: Final = 16
-"""Joint actions that have a line each; of a game with more none has."""
+_MOST_JOINT: Final = 16
+"""The largest number of joint actions whose shares are plotted; a game with more has no such plot."""
 _MOST_BOARDS: Final = 16
-"""Of the worlds of a replica, side by side."""
-
-
-def window_of(episodes: int, *, worlds: int = 1) -> int:
-    """Return the episodes whose mean is the bold line of a run of so many, as many of each world."""
-    return worlds * ceil(max(10, round(0.02 * episodes)) / worlds)
+"""The largest number of worlds of a replica whose boards are shown side by side."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Curves:
-    """The numbers that a recording plots; a game without a board has nothing else."""
+    """The numbers that a recording plots. The recording of a game without a board shows nothing else."""
 
     agents: tuple[str, ...]
     """The names of the agents, agent 0 first."""
     replicas: int = 1
-    """The number of replicas: each is a thin line, and their mean a thick one."""
+    """The number of replicas. Each is a thin line, and their mean is a thick line."""
     worlds: int = 1
-    """The worlds W of each replica."""
+    """The number of worlds W of each replica."""
     mean_over: int = 10
-    """The episodes of a replica whose mean is the bold line, a multiple of W."""
-    metrics: tuple[str, ...] = tuple(name for name in SOCIAL if name != INCOME)
-    """The metrics that the game reports, and those of the user's own."""
+    """The number of episodes of a replica over which the bold line is a running mean; a multiple of W."""
+    metrics: tuple[str, ...] = tuple(name for name in SOCIAL_METRICS if name != INCOME)
+    """The names of the metrics that the game reports, and of the user's metrics."""
     has_tags: bool = True
     """Whether the game reports who tagged whom."""
     in_force: tuple[str, ...] = ()
-    """What is decided in an episode, in words, e.g. "the tax rate"."""
+    """The names of the values that agents decide on by vote, e.g. "the tax rate"."""
     joint: tuple[str, ...] = ()
-    """The joint actions whose shares are plotted, e.g. "CC" and so on."""
+    """The joint actions whose shares are plotted, e.g. "CC", "CD", "DC" and "DD"."""
 
     @property
     def boards(self) -> int:
-        """How many boards are shown side by side: that of each replica, or, of replicas in several worlds,
-        the first ones of the first."""
+        """Return the number of boards that are shown side by side.
+
+        They are one board for each replica or, with several worlds per replica, those of the first worlds of
+        the first replica.
+        """
         return self.replicas if self.worlds == 1 else min(self.worlds, _MOST_BOARDS)
 
     @property
     def has_lorenz(self) -> bool:
-        """Whether there is a harvest, and somebody to share it with."""
+        """Return whether there is a Lorenz curve: several agents share a harvest."""
         return EQUALITY in self.metrics and len(self.agents) > 1
 
     @property
     def has_tags_between(self) -> bool:
-        """Whether the game reports who tagged whom, and there is somebody to tag."""
+        """Return whether the game has several agents and reports who tagged whom."""
         return self.has_tags and len(self.agents) > 1
 
     @property
     def has_institutions(self) -> bool:
-        return bool(self.of_agents or self.in_force)
+        """Return whether institutions take, give or decide anything that can be plotted."""
+        return bool(self.agent_amounts or self.in_force)
 
     @property
-    def of_agents(self) -> tuple[str, ...]:
-        """What each agent breaks, pays and gets, by the names of its lines."""
-        return tuple(name for name in OF_AGENTS if f"{INSTITUTIONS}{name}" in self.metrics)
+    def agent_amounts(self) -> tuple[str, ...]:
+        """Return the names of the plots with a line for each agent: violations, fines and transfers."""
+        return tuple(name for name in AGENT_TOTALS if f"{INSTITUTIONS}{name}" in self.metrics)
 
     @property
     def unit(self) -> str:
-        """Apples, or "return" for the sum of rewards in a game that reports no harvest."""
+        """Return "apples", or "return" for the sum of rewards in a game that reports no harvest."""
         return "apples" if COLLECTIVE_RETURN in self.metrics else "return"
 
     @property
     def bold(self) -> str:
-        """What the bold line is, in words."""
+        """Return the words that explain the bold line of a plot."""
         return f"bold: mean of {self.mean_over} episodes"
 
     @property
     def legend(self) -> str:
-        """What the lines of plots are, and how many episodes a point of them is of."""
+        """Return the words that explain the lines of all plots."""
         point = "" if self.worlds == 1 else f"a point is the mean of {self.worlds} episodes; "
         thin = "thin: a replica, " if self.replicas > 1 else ""
         return f"Curves by episode: {point}{thin}{self.bold}, grey: random play"
@@ -105,50 +104,67 @@ class Curves:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene(Curves):
-    """The contents of the board that a recording shows."""
+    """The board that a recording shows, beside the numbers that it plots."""
 
     height: int
+    """The number of rows H."""
     width: int
+    """The number of columns W."""
     walls: tuple[tuple[int, int], ...]
-    """(row, col) of each cell of inner wall."""
+    """(row, col) of each wall inside the board."""
     sites: tuple[tuple[int, int], ...]
     """(row, col) of each of the K sites, the cells where apples grow."""
     window: tuple[int, int]
-    """(X, Y) of a window."""
+    """The rows and the columns (X, Y) of an agent's window."""
     caption: str = "itself blue at the bottom; others red"
-    """How to read windows."""
+    """The words that explain the colours in the agents' windows."""
     actions: int = 8
     """The number of actions A."""
     is_replay: bool = False
-    """Whether it is one episode of a stored policy; then harvest and stock are plotted turn by turn, and
-    there are no curves over episodes."""
+    """Whether the recording shows a single episode of a stored policy. Then harvest and stock are plotted
+    turn by turn, and nothing is plotted over episodes."""
 
 
-def curves_of(
+def plotted_numbers(
     env: EnvBase,
     agents: tuple[str, ...],
     reported: Sequence[str],
     *,
     episodes: int,
     worlds: int = 1,
-    own: Sequence[str] = (),
+    user_metrics: Sequence[str] = (),
 ) -> Curves:
-    """Return the numbers of an environment that are plotted, and metrics of the user's own by their names."""
+    """Return the numbers that the recording of a training plots.
+
+    Args:
+        env: the worlds of all replicas.
+        agents: the names of the agents.
+        reported: the entries that the game reports, see `cprl.measuring.registry.reported_by`.
+        episodes: the number of episodes of each replica.
+        worlds: the number of worlds of each replica.
+        user_metrics: the names of the user's metrics.
+    """
+    mean_over = max(10, round(0.02 * episodes))
+    in_force: tuple[str, ...] = ()
+    if "in_force" in reported:
+        in_force = decisions_of(env)
     joint = joint_actions(env)
+    if len(joint) > _MOST_JOINT:
+        joint = ()
     return Curves(
         agents=agents,
         replicas=env.batch_size.numel() // worlds,
         worlds=worlds,
-        mean_over=window_of(episodes, worlds=worlds),
-        metrics=(*metrics_of(env, reported), *own),
+        mean_over=worlds * ceil(mean_over / worlds),
+        metrics=(*metrics_of(env, reported), *user_metrics),
         has_tags="tagged_by" in reported,
-        in_force=decisions_of(env) if "in_force" in reported else (),
-        joint=joint if len(joint) <= MOST_JOINT else (),
+        in_force=in_force,
+        joint=joint,
     )
 
 
 def scene_of(env: CommonsEnv, curves: Curves, *, is_replay: bool = False) -> Scene:
-    """Return the scene of an environment's recording, and the numbers that are plotted beside it."""
+    """Return the board of an environment, together with the numbers that are plotted beside it."""
     board = env.game.map
     return Scene(
         **vars(curves),
@@ -166,12 +182,15 @@ def scene_of(env: CommonsEnv, curves: Curves, *, is_replay: bool = False) -> Sce
 def _caption(game: Game) -> str:
     if game.observation.agents_apart:
         return "each agent in a colour of its own"
-    stays = self_stays(game.rules.quirks)
-    also = "; as run also agents of lower number" if stays else ""
-    return "itself blue at the bottom" + (f"{also}; others red" if game.agents > 1 else "")
+    caption = "itself blue at the bottom"
+    if game.agents == 1:
+        return caption
+    if self_stays(game.rules.quirks):
+        caption += "; as run also agents of lower number"
+    return f"{caption}; others red"
 
 
-_SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
+_NEEDED_ENTRIES: Final[Mapping[str, tuple[str, ...]]] = {
     "new bests": ("harvest",),
     "who tagged whom": ("tagged_by",),
     "the Lorenz curve": ("harvest",),
@@ -180,28 +199,32 @@ _SHOWN: Final[Mapping[str, tuple[str, ...]]] = {
     "the stock over the turn": ("board",),
     "the board and what agents see": ("board",),
 }
-"""The views of a recording besides metrics, and the entries that each needs."""
+"""The views of a recording beside the metrics, each with the entries that the game must report for it."""
 
 
 def missing_in(reported: Sequence[str], *, has_board: bool) -> list[str]:
-    """Return lines that name what the recording lacks, and why."""
-    lines = left_out([*reported, *(["board"] if has_board else [])], more=_SHOWN).split("; ")
-    return [line for line in lines if line]
+    """Return the texts that name the views that a recording lacks, and the entries missing for them."""
+    entries = [*reported, "board"] if has_board else reported
+    return list(filter(None, left_out_note(entries, more=_NEEDED_ENTRIES).split("; ")))
 
 
-_WINDOWS_WIDE, _BOARDS_WIDE = 1.7, 3.0
-"""The width of the viewer's area for windows, and of half a tab, divided by its height, about."""
+_WINDOWS_ASPECT: Final = 1.7
+"""About the ratio of width to height of the viewer's area for windows."""
+_BOARDS_ASPECT: Final = 3.0
+"""About the ratio of width to height of half a tab."""
 _LABEL_SHARE: Final = 0.3
-"""The height of a line of text, of that of a board: texts have a size of their own on the screen."""
+"""The room for the text above a board, as a share of the board's height: texts have a fixed size."""
 
 
 class Panels:
-    """The places of equal boards in one image, a pixel apart.
+    """The positions of boards of equal size in one image, with a pixel between them.
 
     Args:
-        wide: the width of the viewer's area, divided by its height.
-        columns: how many stand side by side; by default so many that they are as large as possible.
-        has_labels: whether there is room for a text above each.
+        count: the number of boards.
+        size: the rows and the columns of a board.
+        aspect: the ratio of width to height of the area in which the viewer shows the image.
+        columns: the number of boards in a row; by default the number that makes the boards largest.
+        has_labels: whether to leave room for a text above each board.
     """
 
     def __init__(
@@ -209,26 +232,29 @@ class Panels:
         count: int,
         size: tuple[int, int],
         *,
-        wide: float = _BOARDS_WIDE,
+        aspect: float = _BOARDS_ASPECT,
         columns: int | None = None,
         has_labels: bool = True,
     ) -> None:
         self.size = size
-        self._label = max(2, ceil(_LABEL_SHARE * size[0])) if has_labels else 0
-        apart = np.array((size[0] + self._label + 1, size[1] + 1))
+        self._label_rows = max(2, ceil(_LABEL_SHARE * size[0])) if has_labels else 0
+        row_spacing = size[0] + self._label_rows + 1
+        column_spacing = size[1] + 1
 
         def cell_size(columns: int) -> float:
-            return min(wide / (columns * int(apart[1])), 1 / (ceil(count / columns) * int(apart[0])))
+            rows = ceil(count / columns)
+            return min(aspect / (columns * column_spacing), 1 / (rows * row_spacing))
 
         self.columns = columns or max(range(1, count + 1), key=cell_size)
-        self.corners = np.stack(np.divmod(np.arange(count), self.columns), 1) * apart + (self._label, 0)
+        position = np.stack(np.divmod(np.arange(count), self.columns), 1)
+        self.corners = position * np.array((row_spacing, column_spacing)) + (self._label_rows, 0)
         """int [count, 2], the top-left (row, col) of each board."""
         rows, width = (self.corners.max(0) + size).tolist()
         self.shape: tuple[int, int] = (rows, width)
         """The rows and columns of the image."""
 
-    def joined(self, boards: NDArray[Any], background: Any) -> NDArray[Any]:
-        """Return one image of all boards: [count, rows, columns, ...] to [*shape, ...]."""
+    def join(self, boards: NDArray[Any], background: Any) -> NDArray[Any]:
+        """Join all boards in one image: [count, rows, columns, ...] to [*shape, ...]."""
         image = np.empty((*self.shape, *boards.shape[3:]), boards.dtype)
         image[:] = background
         for (top, left), board in zip(self.corners, boards, strict=True):
@@ -236,42 +262,48 @@ class Panels:
         return image
 
     def labels(self, colours: Sequence[Colour] | None = (TEXT,)) -> Any:
-        """Return the points at which texts stand, as Rerun's static part of `Points2D`; labels vary, and
-        colours for None: what is static hides what is not."""
+        """Return the static part of the texts above boards: their positions, and their colours unless None.
+
+        The texts, and colours that vary, are logged with a time, because static data hides data with a time.
+        """
         return rr.Points2D.from_fields(positions=self.tops, radii=[0.0], colors=colours, show_labels=True)
 
     @property
     def tops(self) -> Float32:
-        """Where the text of each board stands, (x, y)."""
-        tops: Float32 = self.corners[:, ::-1] + (self.size[1] / 2, 0.1 - self._label)
-        return tops.astype(np.float32)
+        """Return the position (x, y) of the text above each board, float32 [count, 2]."""
+        tops = self.corners[:, ::-1] + (self.size[1] / 2, 0.1 - self._label_rows)
+        return np.asarray(tops, np.float32)
 
 
 def boards_of(scene: Scene, count: int) -> Panels:
-    """Return the places of so many boards with their rim."""
+    """Return the positions of boards with their rim in one image."""
     return Panels(count, (scene.height + 2, scene.width + 2))
 
 
 def windows_of(agents: int, window: tuple[int, int]) -> Panels:
-    """Return the places of the agents' windows (X, Y)."""
-    return Panels(agents, window, wide=_WINDOWS_WIDE, has_labels=False)
+    """Return the positions of the agents' windows of X rows and Y columns in one image."""
+    return Panels(agents, window, aspect=_WINDOWS_ASPECT, has_labels=False)
 
 
-HIGH: Final = 12
-"""The height of a panel of bars, in pixels: the largest bar has one less."""
-BELOW: Final = 4
-"""The room below bars for the names of actions."""
-BAR, APART = 5, 1
-"""The width of a bar and of the gap, in pixels."""
+BAR_HIGH: Final = 12
+"""The height of a panel of bars, in pixels; the longest bar is one pixel shorter."""
+_NAMES_HIGH: Final = 4
+"""The room below bars for the names of actions, in pixels."""
+BAR_WIDE: Final = 5
+"""The width of a bar, in pixels."""
+BAR_GAP: Final = 1
+"""The width of the gap between two bars, in pixels."""
 
 
 def decision_panels(agents: int, actions: int, window: tuple[int, int]) -> Panels:
-    """Return the places of the agents' bars, arranged as their windows (X, Y) are."""
+    """Return the positions of the agents' panels of bars in one image, arranged as their windows are."""
     columns = windows_of(agents, window).columns
-    return Panels(agents, (HIGH + BELOW, actions * (BAR + APART) + APART), columns=columns)
+    return Panels(agents, (BAR_HIGH + _NAMES_HIGH, actions * (BAR_WIDE + BAR_GAP) + BAR_GAP), columns=columns)
 
 
-PLOT_WIDE, PLOT_HIGH = 260.0, 80.0
-"""The size of a plot that is not over time, in the view's units; (0, 0) is the top left of its area."""
+PLOT_WIDE: Final = 260.0
+"""The width of a plot that is not over time, in the view's units; (0, 0) is the top left of its area."""
+PLOT_HIGH: Final = 80.0
+"""The height of such a plot."""
 TITLE: Final = PLOT_WIDE / 2, -22.0
-"""Where its title hangs."""
+"""The position (x, y) of the title of such a plot."""

@@ -1,9 +1,9 @@
-"""Effects of the factors of a grid: means over its cells compared within each replica.
+"""Main effects and interactions of the factors of a grid.
 
-A main effect of a factor is the difference between the means over all cells at two of its levels. An
-interaction of two factors is how much larger the effect of the one is at a level of the other. Each is a
-weighted sum of the conditions within a replica; its interval is by Student's t over replicas, and Holm's
-method is for all effects on one metric together.
+The main effect of a factor compares two of its levels: it is the difference between the means over all cells
+of the grid with the one level and with the other. The interaction of two factors says how much larger the
+effect of one factor is at a level of the other. Each effect is a weighted sum of the conditions, computed in
+every replica. Its interval is by Student's t over replicas; Holm's method covers all effects on one metric.
 """
 
 from collections.abc import Iterator, Sequence
@@ -12,30 +12,30 @@ from math import prod
 from typing import Any, Final
 
 from cprl.measuring.registry import title
-from cprl.measuring.statistics import Family, Weights, contrasts, crossed, main_effect, mean_difference
+from cprl.measuring.statistics import CellWeights, Family, contrasts, crossed, main_effect, mean_difference
 from cprl.studies.study import level_text, short_names
 from cprl.studies.tables.comparing import (
     INTERVALS,
     capitalised,
-    change,
+    compared_metrics,
+    difference_cell,
     episodes_text,
-    metrics_of,
 )
-from cprl.studies.tables.table import TRAINING, Design, StudyTable
-from cprl.terminal.tables import Cells
+from cprl.studies.tables.tidy_table import TRAINING_PART, StudyDesign, StudyTable
+from cprl.terminal.text_tables import TextTable
 
 MOST_INTERACTIONS: Final = 24
-"""More are left out: so many tests together would show nothing."""
+"""The largest number of interactions. More are left out, since so many tests together show nothing."""
 
 Levels = tuple[Any, Any]
 """A level of a factor, and the one that it is compared with."""
 
 
-def weights_of(table: StudyTable) -> dict[str, Weights]:
-    """Return what each condition counts in the main effects of a grid and its interactions of two factors, by
-    their names; none where it has a single factor, a cell without a replica, or replicas that are not paired.
+def effect_weights(table: StudyTable) -> dict[str, CellWeights]:
+    """Return the weight of each condition in every main effect and interaction, by the name of the effect.
 
-    Levels are compared with the lowest one where all are numbers, else with that of the reference.
+    Levels are compared with the lowest level if all are numbers, or else with the level of the reference. A
+    table that is not a whole grid, see `is_whole_grid`, has no effects.
     """
     design = table.design
     if not (design.is_grid and is_whole_grid(table)):
@@ -57,7 +57,7 @@ def weights_of(table: StudyTable) -> dict[str, Weights]:
 
 
 def is_whole_grid(table: StudyTable) -> bool:
-    """Return whether a table has each combination of the levels of two factors or more, in pairs."""
+    """Return whether a table has paired replicas for all combinations of at least two factors."""
     design = table.design
     varied = [factor for factor in design.factors if len(set(design.levels(factor))) > 1]
     cells = {tuple(levels.values()) for levels in design.conditions.values()}
@@ -66,14 +66,14 @@ def is_whole_grid(table: StudyTable) -> bool:
     return is_whole and len(varied) > 1 and design.is_paired and all(table.replicas.values())
 
 
-def interactions_of(design: Design) -> int:
-    """Return how many interactions of two factors there are."""
+def interactions_of(design: StudyDesign) -> int:
+    """Return the number of interactions of two factors."""
     steps = [len(set(design.levels(factor))) - 1 for factor in design.factors]
     return sum(one * other for one, other in combinations(steps, 2))
 
 
-def _main_effects(design: Design, factor: str) -> dict[str, Weights]:
-    """Return the signs of the conditions in each effect of a factor, by the levels that it compares."""
+def _main_effects(design: StudyDesign, factor: str) -> dict[str, CellWeights]:
+    """Return the weights of conditions in each main effect of a factor, by the levels that it compares."""
     at = {name: levels[factor] for name, levels in design.conditions.items()}
     return {
         f"{level_text(level)} against {level_text(first)}": main_effect(at, level, first)
@@ -81,7 +81,8 @@ def _main_effects(design: Design, factor: str) -> dict[str, Weights]:
     }
 
 
-def _compared_levels(design: Design, factor: str) -> Iterator[Levels]:
+def _compared_levels(design: StudyDesign, factor: str) -> Iterator[Levels]:
+    """Yield each level of a factor with the level that it is compared with."""
     levels = list(dict.fromkeys(design.levels(factor)))
     if all(isinstance(level, bool | int | float) for level in levels):
         first, *others = sorted(levels)
@@ -92,23 +93,25 @@ def _compared_levels(design: Design, factor: str) -> Iterator[Levels]:
         yield level, first
 
 
-def effects_of(table: StudyTable, metric: str, *, part: str = TRAINING) -> Family:
-    """Return the effects of a grid on a metric, by effect and metric; none where there is no grid."""
+def effects_of(table: StudyTable, metric: str, *, part: str = TRAINING_PART) -> Family:
+    """Return the effects on a metric, by effect and metric."""
     rows = table.windows(part)
-    return contrasts(rows, metric, "condition", weights_of(table))
+    return contrasts(rows, metric, "condition", effect_weights(table))
 
 
-def effect_cells(table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING) -> list[Cells]:
-    """Return a row for each effect of a grid, a column for each metric; nothing where there are none."""
-    names = list(weights_of(table))
+def effect_tables(
+    table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING_PART
+) -> list[TextTable]:
+    """Return a table with a row for each effect and a column for each metric; [] if there are no effects."""
+    names = list(effect_weights(table))
     if not names:
         return []
-    chosen = metrics_of(table, metrics, part=part)
+    chosen = compared_metrics(table, metrics, part=part)
     families = {metric: effects_of(table, metric, part=part) for metric in chosen}
     rows = []
     for name in names:
-        of_row = [family.get((name, metric)) for metric, family in families.items()]
-        rows.append([name, *map(change, of_row)])
+        effects = [family.get((name, metric)) for metric, family in families.items()]
+        rows.append([name, *map(difference_cell, effects)])
     what = (
         "effects of the factors, differences between means over all cells, paired by replica; with x, how "
         "much larger the first difference is at the second factor's level"
@@ -117,4 +120,4 @@ def effect_cells(table: StudyTable, metrics: Sequence[str] = (), *, part: str = 
     if (left_out := interactions_of(table.design)) > MOST_INTERACTIONS:
         note += f" The {left_out} interactions of two factors are left out."
     heading = f"{capitalised(episodes_text(table, part))}; {what}; {INTERVALS}."
-    return [Cells(heading, ["effect", *map(title, chosen)], rows, note)]
+    return [TextTable(heading, ["effect", *map(title, chosen)], rows, note)]

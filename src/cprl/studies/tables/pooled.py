@@ -10,13 +10,13 @@ from cprl.experiment import Experiment
 from cprl.runs.recipe import read_recipe, runs_in
 from cprl.runs.states import state_of
 from cprl.studies.factors import ALL, normalised, values_at
-from cprl.studies.study import UNNAMED, Condition, named, short_names, unlike
-from cprl.studies.tables.sources import Source, clocks_of, plain_level, reason_of, table_of
-from cprl.studies.tables.table import WINDOW, Design, StudyTable, some
-from cprl.values import differences, refusal, to_config
+from cprl.studies.study import NOT_IN_CHECKSUM, Condition, condition_name, short_names, unique_name
+from cprl.studies.tables.sources import RunSource, clocks_of, plain_level, reason_missing, table_of_sources
+from cprl.studies.tables.tidy_table import WINDOW_EPISODES, StudyDesign, StudyTable, abbreviated
+from cprl.values import describe_changes, refusal, to_config
 
 _MOST_NAMED: Final = 5
-_NOT_COMPARED: Final = (*UNNAMED, "evaluation_episodes")
+_NOT_COMPARED: Final = (*NOT_IN_CHECKSUM, "evaluation_episodes")
 
 Experiments = Mapping[Path, Experiment]
 
@@ -25,13 +25,14 @@ def pooled_table(
     runs: Sequence[Path | str],
     *,
     by: Sequence[str],
-    window: int = WINDOW,
+    window: int = WINDOW_EPISODES,
     reference: str | None = None,
 ) -> StudyTable:
-    """Return the table of any runs. Runs with the same values are pooled: their replicas count together.
+    """Return the table of any runs, grouped into conditions by some fields of their experiments.
 
-    Replicas are numbered by the seeds of their runs, so that the same number in two conditions has the same
-    seed; where all conditions have the same seeds, they are paired.
+    Runs with the same values of these fields form one condition, and their replicas are pooled. Replicas are
+    numbered by the seeds of their runs, so that replicas with the same number have the same seed. They are
+    paired if all conditions have the same seeds.
 
     Args:
         runs: directories of runs, or of directories that hold them; results that `cprl export` made too.
@@ -50,21 +51,22 @@ def pooled_table(
     if reference is not None and reference not in groups:
         raise refusal("reference", reference, f"the name of a condition: {', '.join(list(groups)[:10])}")
     firsts = _firsts(experiments.values())
-    sources = [
-        Source(
-            run=run,
-            name=str(run),
-            condition=name,
-            checksum=Condition(experiment).checksum_in(run.parent),
-            first=firsts[experiment.seed],
-            experiment=experiment,
-            reason=reason_of(state_of(run)),
-        )
-        for name, members in groups.items()
-        for run, experiment in members.items()
-    ]
-    seeds = {frozenset(experiment.seed for experiment in members.values()) for members in groups.values()}
-    design = Design(
+    sources = []
+    seeds = set()
+    for name, members in groups.items():
+        seeds.add(frozenset(experiment.seed for experiment in members.values()))
+        for run, experiment in members.items():
+            source = RunSource(
+                run=run,
+                name=str(run),
+                condition=name,
+                checksum=Condition(experiment).checksum_in(run.parent),
+                first=firsts[experiment.seed],
+                experiment=experiment,
+                reason=reason_missing(state_of(run)),
+            )
+            sources.append(source)
+    design = StudyDesign(
         name=f"{len(paths)} runs by {', '.join(fields)}",
         conditions=conditions,
         reference=next(iter(groups)) if reference is None else reference,
@@ -72,14 +74,13 @@ def pooled_table(
         notes=tuple(_notes(groups, fields)),
         clocks=clocks_of({name: members.values() for name, members in groups.items()}),
     )
-    return table_of(design, sources, window=window)
+    return table_of_sources(design, sources, window=window)
 
 
 def _groups(
     experiments: Experiments, fields: Sequence[str]
 ) -> tuple[dict[str, dict[str, Any]], dict[str, dict[Path, Experiment]]]:
-    """Return the levels and the runs of each condition by its name; in the order of numbers, else of the
-    runs."""
+    """Return the levels and the runs of each condition, by its name; ordered by numeric levels."""
     by_values: dict[str, tuple[list[Any], dict[Path, Experiment]]] = {}
     for run, experiment in experiments.items():
         values = [_value_at(experiment, path, run) for path in fields]
@@ -90,7 +91,7 @@ def _groups(
     groups: dict[str, Any] = {}
     for values, members in sorted(by_values.values(), key=lambda group: list(map(_rank, group[0]))):
         levels = {path: plain_level(value) for path, value in zip(fields, values, strict=True)}
-        name = unlike(named({short[path]: level for path, level in levels.items()}), groups)
+        name = unique_name(condition_name({short[path]: level for path, level in levels.items()}), groups)
         conditions[name] = levels
         groups[name] = members
     return conditions, groups
@@ -110,10 +111,13 @@ def _rank(value: Any) -> tuple[int, float]:
 
 
 def _refuse_seeds_twice(name: str, experiments: Experiments) -> None:
+    """Refuse runs of one condition with the same seed, which would count replicas twice."""
     for (one, first), (other, second) in combinations(experiments.items(), 2):
         if first.seed == second.seed:
             places = _places(first, second)
-            why = f"they differ in {some(places, _MOST_NAMED)}" if places else "they are the same experiment"
+            why = "they are the same experiment"
+            if places:
+                why = f"they differ in {abbreviated(places, _MOST_NAMED)}"
             raise ValueError(
                 f"{one} and {other} have the same seed, {first.seed}, and both {name}, which would count "
                 f"replicas twice; {why}; allowed: each seed once in a condition, or another field in by"
@@ -129,33 +133,36 @@ def _firsts(experiments: Iterable[Experiment]) -> dict[int, int]:
 
 
 def _notes(groups: Mapping[str, Experiments], fields: Sequence[str]) -> Iterator[str]:
-    """Return what runs of one condition, and the conditions themselves, differ in beside the fields asked
-    for."""
+    """Yield warnings of other fields in which the runs of a condition, or the conditions, differ."""
     firsts = []
     for name, members in groups.items():
         first, *others = members.values()
         firsts.append(first)
         places = sorted({place for other in others for place in _places(first, other)})
         if places:
-            yield f"The runs pooled as {name} also differ in {some(places, _MOST_NAMED)}."
+            yield f"The runs pooled as {name} also differ in {abbreviated(places, _MOST_NAMED)}."
     more = {place for other in firsts[1:] for place in _places(firsts[0], other)}
-    places = sorted(place for place in more if not any(_is_within(place, path) for path in fields))
+    places = sorted(place for place in more if not _is_within(place, fields))
     if places:
-        yield f"The conditions also differ in {some(places, _MOST_NAMED)}."
+        yield f"The conditions also differ in {abbreviated(places, _MOST_NAMED)}."
 
 
 def _places(one: Experiment, other: Experiment) -> list[str]:
-    """Return the places in which two experiments differ, as paths, without what is no condition."""
+    """Return the paths in which two experiments differ, without fields that are part of no condition."""
     before = one.to_config()
     now = other.to_config()
     for name in _NOT_COMPARED:
         before[name] = now[name]
-    lines = differences(before, now, "")
+    lines = describe_changes(before, now, "")
     return [line.partition(" was ")[0].lstrip(".").replace("[", ".").replace("]", "") for line in lines]
 
 
-def _is_within(place: str, path: str) -> bool:
-    parts = place.split(".")
-    wanted = path.split(".")
-    matches = [part in (ALL, at) for part, at in zip(wanted, parts, strict=False)]
-    return len(matches) == len(wanted) and all(matches)
+def _is_within(place: str, paths: Sequence[str]) -> bool:
+    """Return whether a place lies at, or within, one of the paths."""
+    names = place.split(".")
+    for path in paths:
+        parts = path.split(".")
+        matches = [part in (ALL, name) for part, name in zip(parts, names, strict=False)]
+        if len(matches) == len(parts) and all(matches):
+            return True
+    return False

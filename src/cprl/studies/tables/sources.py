@@ -1,4 +1,4 @@
-"""The table of finished runs: which runs it is made of, their episodes as rows, and how replicas end."""
+"""Building the table of a study: reading finished runs, and averaging their episodes in windows."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -15,33 +15,33 @@ from cprl.envs.unwrap import clock_in
 from cprl.experiment import Experiment
 from cprl.measuring.outcome import RULE, outcome_of
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, INSTITUTIONS, METRICS, TOTALS
-from cprl.measuring.table import WINDOWS, by_replica, complete, metrics_in, where, world_of
-from cprl.measuring.windows import episodes_after, rounds_of
+from cprl.measuring.table import WINDOWS, by_replica, complete, stored_metrics, where, world_of
+from cprl.measuring.windows import episodes_after, episodes_per_world
 from cprl.population import any_learns
 from cprl.runs.episodes import read_episodes, read_rows
 from cprl.runs.files import REPORT, read_json
-from cprl.runs.recipe import parts_of, read_recipe
+from cprl.runs.recipe import read_recipe, recipe_parts
 from cprl.studies.status import Status
-from cprl.studies.study import Study, level_text, unlike
-from cprl.studies.tables.table import (
-    COLUMNS,
+from cprl.studies.study import Study, level_text, unique_name
+from cprl.studies.tables.tidy_table import (
+    CIRCUMSTANCES,
     DAMAGED,
-    PARTS,
-    RANDOM,
-    TRAINING,
+    RANDOM_PART,
+    RUN_PARTS,
+    TABLE_COLUMNS,
+    TRAINING_PART,
     UNKNOWN,
-    WINDOW,
-    WORDS,
+    WINDOW_EPISODES,
     Circumstances,
-    Design,
-    Lacking,
+    MissingRun,
+    StudyDesign,
     StudyTable,
-    counted,
+    count_circumstances,
 )
 from cprl.studies.trials import DirectoryState, trials_of
 from cprl.system.output import legible
 from cprl.values import Positive, checked
-from cprl.values.arrays import Int64
+from cprl.values.array_types import Int64
 
 REASONS: Final[dict[DirectoryState, str]] = {
     "missing": "was not begun",
@@ -53,39 +53,41 @@ REASONS: Final[dict[DirectoryState, str]] = {
 
 
 class TooShortError(ValueError):
-    """A replica has ended no episode in the steps that it trained."""
+    """A replica has not finished a single episode in its training."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Source:
-    """A run, and which replicas of which condition it holds."""
+class RunSource:
+    """A run that belongs into a table: its condition, its replicas, and whether it is finished."""
 
     run: Path
     name: str
-    """What the run is called in the table."""
+    """The name of the run in the table."""
     condition: str
     checksum: str
     """See `cprl.studies.study.Condition`."""
     first: int
-    """The number of its first replica in the table."""
+    """The number, in the table, of the run's first replica."""
     experiment: Experiment
     reason: str = ""
-    """Why it is no part of the table; "" of a finished run."""
+    """The reason why the run is missing in the table; "" for a finished run."""
 
 
 def study_table(
-    study: Study, runs: Path | str, *, window: int = WINDOW, status: Path | None = None
+    study: Study, runs: Path | str, *, window: int = WINDOW_EPISODES, status: Path | None = None
 ) -> StudyTable:
     """Return the table of the finished runs of a study.
 
     Args:
-        window: episodes of a window of training; 1 for episodes one by one, of the evaluation too.
-        status: where its trials say why they failed, see `cprl.studies.trials`.
+        window: the number of episodes in a window of the training; with 1, rows of the evaluation are single
+            episodes too.
+        status: the folder in which trials write why they failed, see `cprl.studies.status`.
     """
-    return table_of(design_of(study), sources_of(study, Path(runs), status), window=window)
+    return table_of_sources(design_of(study), sources_of(study, Path(runs), status), window=window)
 
 
-def design_of(study: Study) -> Design:
+def design_of(study: Study) -> StudyDesign:
+    """Return the design of a study, as its table stores it."""
     conditions: dict[str, dict[str, Any]] = {condition.name: {} for condition in study.all_conditions}
     for factor in study.factors:
         plain: dict[int, Any] = {}  # by the identity of a level, as levels that differ may have equal texts
@@ -93,9 +95,9 @@ def design_of(study: Study) -> Design:
             level = condition.levels[factor]
             if id(level) not in plain:
                 text = plain_level(level)
-                plain[id(level)] = unlike(text, set(plain.values())) if isinstance(text, str) else text
+                plain[id(level)] = unique_name(text, set(plain.values())) if isinstance(text, str) else text
             conditions[condition.name][factor] = plain[id(level)]
-    return Design(
+    return StudyDesign(
         name=study.name,
         conditions=conditions,
         reference=study.reference_name,
@@ -108,104 +110,115 @@ def design_of(study: Study) -> Design:
 
 
 def clocks_of(experiments: Mapping[str, Iterable[Experiment]]) -> dict[str, int]:
-    """Return the turns of an episode at most, by condition, where all its games say so."""
-    clocks = {name: [clock_in(one.game) for one in of_one] for name, of_one in experiments.items()}
-    return {name: max(filter(None, each)) for name, each in clocks.items() if None not in each}
+    """Return the maximal number of steps of an episode, by condition, if all its games have one."""
+    clocks = {}
+    for name, members in experiments.items():
+        turns = [clock_in(experiment.game) for experiment in members]
+        if None not in turns:
+            clocks[name] = max(filter(None, turns))
+    return clocks
 
 
-def sources_of(study: Study, runs: Path, status: Path | None = None) -> list[Source]:
-    """Return the runs of a study; `status` is where its trials say why they failed."""
+def sources_of(study: Study, runs: Path, status: Path | None = None) -> list[RunSource]:
+    """Return the runs of a study, finished or not.
+
+    Args:
+        status: the folder in which trials write why they failed.
+    """
     sources = []
     for trial in trials_of(study, runs):
         failure = None if status is None else Status(status, trial.name).failure()
-        source = Source(
-            run=runs / trial.name,
+        source = RunSource(
+            run=trial.directory,
             name=trial.name,
             condition=trial.condition.name,
             checksum=trial.checksum,
             first=trial.block.first,
             experiment=trial.experiment,
-            reason=reason_of(trial.state(runs), failure),
+            reason=reason_missing(trial.state(), failure),
         )
         sources.append(source)
     return sources
 
 
-def reason_of(state: DirectoryState, failure: str | None = None) -> str:
-    """Return why a run is no part of a table; "" of a finished one."""
+def reason_missing(state: DirectoryState, failure: str | None = None) -> str:
+    """Return the reason why a run is missing in a table; "" for a finished run."""
     if state == "finished":
         return ""
     return REASONS[state] if failure is None else f"failed: {failure}"
 
 
 def plain_level(value: Any) -> Any:
-    """Return a level as a table holds it: a number or truth value as it is, else a text."""
+    """Return a level as a table stores it: numbers and bools unchanged, anything else as text."""
     return value if isinstance(value, bool | int | float) else level_text(value)
 
 
-def table_of(design: Design, sources: Sequence[Source], *, window: int = WINDOW) -> StudyTable:
+def table_of_sources(
+    design: StudyDesign, sources: Sequence[RunSource], *, window: int = WINDOW_EPISODES
+) -> StudyTable:
     """Return the table of finished runs.
 
     Args:
         design: the conditions that are compared.
-        sources: the runs; what is not finished, or damaged, is listed as lacking.
+        sources: the runs. Those that are not finished, or damaged, are listed as missing.
     """
     checked("window", window, Positive)
     rows = [_SCHEMA.empty_table()]
-    lacking = []
-    read: list[Source] = []
+    missing = []
+    read: list[RunSource] = []
     endings: dict[str, list[str]] = {}
     steps: dict[str, list[int]] = {}
-    made: dict[str, Circumstances] = {}
+    provenance: dict[str, Circumstances] = {}
     for source in sources:
         reason = source.reason
         try:
             if not reason:
                 tables = _tables_of(source)
-                words = _endings(tables)
-                made[source.name] = circumstances_of(source.run)
+                outcomes = _outcome_words(tables)
+                provenance[source.name] = circumstances_of(source.run)
         except TooShortError as error:
             reason = f"is too short: {error}"
         except (ValueError, OSError, KeyError) as error:
             reason = f"{DAMAGED}: {error}"
         if reason:
-            lacking.append(Lacking(source.name, source.condition, source.experiment.replicas, reason))
+            missing.append(MissingRun(source.name, source.condition, source.experiment.replicas, reason))
             continue
         read.append(source)
         rows += [_windows(table, source, part, window) for part, table in tables.items()]
-        endings.setdefault(source.condition, []).extend(words)
+        endings.setdefault(source.condition, []).extend(outcomes)
         steps.setdefault(source.condition, []).extend(_steps_of(source.run))
-    study_rows = _rows(design, pa.concat_tables(rows), marks(made))
+    study_rows = _rows(design, pa.concat_tables(rows), differing_circumstances(provenance))
     return StudyTable(
         design=design,
         rows=study_rows,
         window=window,
-        lacking=tuple(lacking),
-        made=made,
-        endings={name: dict(Counter(sorted(words)).most_common()) for name, words in endings.items()},
-        ending_rules=(RULE,) * bool(made),
+        missing_runs=tuple(missing),
+        provenance=provenance,
+        endings={name: dict(Counter(sorted(ended)).most_common()) for name, ended in endings.items()},
+        ending_rules=(RULE,) * bool(provenance),
         agents_learn=not read or any(any_learns(source.experiment.agents) for source in read),
         lengths=_lengths(study_rows, steps),
     )
 
 
 def _lengths(rows: pa.Table, steps: Mapping[str, list[int]]) -> dict[str, dict[str, tuple[int, int]]]:
-    """Return the least and the most episodes and steps of replicas, of conditions whose steps are known."""
+    """Return the smallest and the largest number of episodes and steps of a replica, by condition."""
     if not len(rows):
         return {}
-    played = by_replica(where(rows, part=TRAINING), rows["metric"][0].as_py(), ["condition"])
+    played = by_replica(where(rows, part=TRAINING_PART), rows["metric"][0].as_py(), ["condition"])
     lengths = {}
-    for name in (name for name, of_runs in steps.items() if of_runs):
-        episodes = where(played, condition=name)["episodes"]
-        least, most = pc.min_max(episodes).as_py().values()
-        lengths[name] = {"episodes": (least, most), "steps": (min(steps[name]), max(steps[name]))}
+    for name, counts in steps.items():
+        if counts:
+            episodes = where(played, condition=name)["episodes"]
+            least, most = pc.min_max(episodes).as_py().values()
+            lengths[name] = {"episodes": (least, most), "steps": (min(counts), max(counts))}
     return lengths
 
 
-def _tables_of(source: Source) -> dict[str, pa.Table]:
-    """Read the episodes of each part of a run, sorted, a row for each agent of each."""
+def _tables_of(source: RunSource) -> dict[str, pa.Table]:
+    """Read the episode tables of the parts of a run, sorted, with a row for each agent."""
     tables = {}
-    for part, name in PARTS.items():
+    for part, name in RUN_PARTS.items():
         folder = source.run / "evaluation"
         table = read_episodes(source.run) if name is None else read_rows(folder / f"{name}.parquet")
         table = table.sort_by([(column, "ascending") for column in ("replica", "episode", "agent")])
@@ -214,8 +227,8 @@ def _tables_of(source: Source) -> dict[str, pa.Table]:
     return tables
 
 
-def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
-    """Refuse a sorted table that has an episode twice, or lacks some."""
+def _refuse_gaps(table: pa.Table, source: RunSource, part: str) -> None:
+    """Refuse a sorted episode table that has an episode twice, or in which episodes are missing."""
     replica, episode, agent = (table[name].to_numpy() for name in ("replica", "episode", "agent"))
     begins = (np.diff(replica, prepend=-1) != 0) | (np.diff(episode, prepend=-1) != 0)
     for row in np.flatnonzero(~begins & (np.diff(agent, prepend=-1) == 0))[:1]:
@@ -224,21 +237,24 @@ def _refuse_gaps(table: pa.Table, source: Source, part: str) -> None:
         )
     counts = Counter(replica[begins].tolist())
     replicas = list(range(source.experiment.replicas))
-    wanted = source.experiment.episodes if part == TRAINING else max(counts.values(), default=0)
-    if wanted is None and (missing := [replica for replica in replicas if replica not in counts]):
+    expected = source.experiment.episodes
+    if part != TRAINING_PART:
+        expected = max(counts.values(), default=0)
+    missing = [replica for replica in replicas if replica not in counts]
+    if expected is None and missing:
         steps = [*_steps_of(source.run), "its"][0]
         raise TooShortError(f"replica {missing[0]} ended no episode in {steps} steps; train longer")
     # Where steps are counted, each replica ends a number of its own.
-    is_whole = set(counts.values()) == {wanted} or wanted is None
+    is_whole = set(counts.values()) == {expected} or expected is None
     if list(counts) != replicas or not is_whole:
         raise ValueError(
-            f"{source.name} has these episodes by replica in {part}: {dict(counts)}; allowed: {wanted} of "
+            f"{source.name} has these episodes by replica in {part}: {dict(counts)}; allowed: {expected} of "
             f"each of {len(replicas)} replicas"
         )
 
 
 def _steps_of(run: Path) -> list[int]:
-    """Return how many steps the report of a run says that it trained; nothing where it does not say."""
+    """Return [steps], the trained steps that a run's report states; [] if it does not state them."""
     try:
         steps = read_json(run / REPORT).get("steps")
     except (OSError, ValueError):  # which ends no table
@@ -246,28 +262,28 @@ def _steps_of(run: Path) -> list[int]:
     return [steps] if isinstance(steps, int) else []
 
 
-def _endings(tables: Mapping[str, pa.Table]) -> list[str]:
-    """Return how the training of each replica went, in a word."""
-    training = tables[TRAINING]
-    random = tables[RANDOM]
+def _outcome_words(tables: Mapping[str, pa.Table]) -> list[str]:
+    """Return a word for the outcome of each replica's training, e.g. "tragedy"."""
+    training = tables[TRAINING_PART]
+    random = tables[RANDOM_PART]
     number = COLLECTIVE_RETURN if COLLECTIVE_RETURN in random.column_names else INCOME
-    by_chance = float(np.mean(where(random, agent=0)[number].to_numpy()))
+    random_return = float(np.mean(where(random, agent=0)[number].to_numpy()))
     replicas = sorted(training["replica"].unique().to_pylist())
-    outcomes = [outcome_of(where(training, replica=replica), random=by_chance) for replica in replicas]
+    outcomes = [outcome_of(where(training, replica=replica), random=random_return) for replica in replicas]
     return [outcome.word for outcome in outcomes]
 
 
-def _windows(table: pa.Table, source: Source, part: str, window: int) -> pa.Table:
-    """Return the windows of a part of a run, for each number and replica.
+def _windows(table: pa.Table, source: RunSource, part: str, window: int) -> pa.Table:
+    """Return a row for each window of a part of a run, for each metric and replica.
 
-    In training, windows are of so many consecutive episodes; in many worlds of as many of each, so that
-    none has more of the short episodes, which end sooner, and the first ones may lack worlds that have ended
-    fewer.
-    Another part is one window, but where episodes stand one by one.
+    A window of the training has a fixed number of consecutive episodes. With many worlds it has the same
+    number of episodes of every world. Otherwise short episodes, which end sooner, would fill the windows.
+    Worlds that have finished fewer episodes are missing in the first windows. Any other part is a single
+    window, unless the window is 1.
     """
     one = where(table, agent=0)
     replica = one["replica"].to_numpy()
-    size = window if part == TRAINING or window == 1 else len(one)
+    size = window if part == TRAINING_PART or window == 1 else len(one)
     world = world_of(one)
     places = [_places(world[replica == number], size) for number in np.unique(replica)]
     place = np.concatenate(places)
@@ -275,10 +291,10 @@ def _windows(table: pa.Table, source: Source, part: str, window: int) -> pa.Tabl
     order = np.argsort(group, kind="stable")
     begin = np.flatnonzero(np.diff(group[order], prepend=-1))
     lengths = np.diff(np.append(begin, len(order)))
-    metrics = [name for name in metrics_in(table.schema) if name not in TOTALS]
+    metrics = [name for name in stored_metrics(table.schema) if name not in TOTALS]
     numbers = {name: one[name].to_numpy() for name in metrics}
     returns = table["return"].to_numpy().astype(np.float64).reshape(len(one), -1)
-    numbers |= {f"agent_{agent}/return": of_agent for agent, of_agent in enumerate(returns.T)}
+    numbers |= {f"agent_{agent}/return": values for agent, values in enumerate(returns.T)}
     values = np.stack(list(numbers.values()))[:, order]
     defined = ~np.isnan(values)
     counts = np.add.reduceat(defined.astype(np.int64), begin, axis=1)
@@ -296,16 +312,20 @@ def _windows(table: pa.Table, source: Source, part: str, window: int) -> pa.Tabl
     return pa.table({field.name: pa.array(columns[field.name], field.type) for field in _SCHEMA})
 
 
-def _labels_of(source: Source, part: str) -> dict[str, str]:
+def _labels_of(source: RunSource, part: str) -> dict[str, str]:
     return {"condition": source.condition, "checksum": source.checksum, "run": source.name, "part": part}
 
 
 def _places(world: Int64, window: int) -> Int64:
-    """Return the number of the window of each episode of a replica, [E]."""
+    """Return the index of the window of each episode of a replica, int64 [E].
+
+    Args:
+        world: the world of each episode, int64 [E].
+    """
     lanes = len(np.unique(world))
     if lanes == 1 or window == 1:
         return np.arange(len(world)) // window
-    after = episodes_after(world) // rounds_of(window, lanes)
+    after = episodes_after(world) // episodes_per_world(window, lanes)
     return np.asarray(after.max() - after)
 
 
@@ -316,14 +336,14 @@ _SCHEMA: Final = pa.schema(
         ("value", pa.float64()),
     ]
 )
-"""Of the windows of a run."""
+"""The columns of the windows of a run."""
 
 
-def _rows(design: Design, rows: pa.Table, marked: Mapping[str, str]) -> pa.Table:
-    """Return the windows of all runs, sorted, with the levels of their conditions."""
+def _rows(design: StudyDesign, rows: pa.Table, marked: Mapping[str, str]) -> pa.Table:
+    """Return the rows of a study's table: the windows of all runs, sorted, with the levels of conditions."""
     orders = {
         "condition": list(design.conditions),
-        "part": list(PARTS),
+        "part": list(RUN_PARTS),
         "metric": _metrics(rows["metric"].unique().to_pylist()),
     }
     rows = rows.combine_chunks()
@@ -332,21 +352,21 @@ def _rows(design: Design, rows: pa.Table, marked: Mapping[str, str]) -> pa.Table
     rows = rows.filter(pc.is_valid(rows["#metric"]))
     keys = ("#condition", "replica", "#part", "#metric", "episode")
     rows = rows.sort_by([(name, "ascending") for name in keys])
-    columns = {name: rows[name] for name in COLUMNS if name != "marks"}
+    columns = {name: rows[name] for name in TABLE_COLUMNS if name != "marks"}
     for factor in design.factors:
-        column = f"factor {factor}" if factor in COLUMNS else factor
+        column = f"factor {factor}" if factor in TABLE_COLUMNS else factor
         columns[column] = _levels(design.levels(factor)).take(rows["#condition"])
     places = pc.index_in(rows["run"], pa.array(list(marked), pa.string()))
     columns["marks"] = pa.array(list(marked.values()), pa.string()).take(places)
     names = list(columns)
-    factors = names[len(COLUMNS) - 1 : -1]
-    return pa.table(columns).select([*COLUMNS[:2], *factors, *COLUMNS[2:]])
+    factors = names[len(TABLE_COLUMNS) - 1 : -1]
+    return pa.table(columns).select([*TABLE_COLUMNS[:2], *factors, *TABLE_COLUMNS[2:]])
 
 
 def _metrics(names: Sequence[str]) -> list[str]:
-    """Return metrics in the order of tables: those of the registry, returns of single agents, and others.
+    """Return metrics in the order of tables: registered metrics, returns of single agents, then others.
 
-    The income is among them where it is not the harvest.
+    Income is left out if no money moves, because it then equals the harvest.
     """
     moves_money = INCOME_EQUALITY in names or any(name.startswith(INSTITUTIONS) for name in names)
     if COLLECTIVE_RETURN in names and not moves_money:
@@ -359,47 +379,51 @@ def _metrics(names: Sequence[str]) -> list[str]:
 
 
 def _levels(levels: Sequence[Any]) -> pa.Array:
-    """Return the levels of all conditions as a column: numbers, truth values, or else texts."""
+    """Return the levels of all conditions as a column of numbers, of bools, or else of texts."""
     if all(isinstance(level, bool) for level in levels):
         return pa.array(levels, pa.bool_())
     if all(isinstance(level, int | float) and not isinstance(level, bool) for level in levels):
         is_whole = all(isinstance(level, int) and abs(level) < 2**63 for level in levels)
-        return pa.array(levels, pa.int64() if is_whole else pa.float64())
+        kind = pa.int64() if is_whole else pa.float64()
+        return pa.array(levels, kind)
     return pa.array(list(map(str, levels)), pa.string())
 
 
 def circumstances_of(run: Path) -> Circumstances:
-    """Return what the recipe of a run says of how it was made."""
-    each = [_circumstances(part) for part in parts_of(read_recipe(run))]
+    """Return how a run was made, from its recipe."""
+    each = [_circumstances(part) for part in recipe_parts(read_recipe(run))]
     joined = {}
     for name in dict.fromkeys(chain.from_iterable(each)):
-        in_order = groupby(made.get(name, UNKNOWN) for made in each)
+        in_order = groupby(part.get(name, UNKNOWN) for part in each)
         joined[name] = " then ".join(value for value, _ in in_order)
     return joined
 
 
 def _circumstances(recipe: Mapping[str, Any]) -> dict[str, str]:
+    """Return versions, user's code, git commit and processor from one part of a recipe.
+
+    A run that was resumed has a part for each time.
+    """
     versions = recipe.get("versions") or {}
-    made = {name: str(version) for name, version in versions.items() if version is not None}
-    made |= {module: str(digest)[:12] for module, digest in (recipe.get("code") or {}).items()}
+    circumstances = {name: str(version) for name, version in versions.items() if version is not None}
+    circumstances |= {module: str(digest)[:12] for module, digest in (recipe.get("code") or {}).items()}
     git = recipe.get("git")
     if isinstance(git, Mapping):
-        made["git"] = f"{str(git.get('commit'))[:12]}{' with changes' if git.get('dirty') else ''}"
+        circumstances["git"] = f"{str(git.get('commit'))[:12]}{' with changes' if git.get('dirty') else ''}"
     if recipe.get("cpu"):
-        made["cpu"] = str(recipe["cpu"])
-    return {legible(name): legible(value) for name, value in made.items()}
+        circumstances["cpu"] = str(recipe["cpu"])
+    return {legible(name): legible(value) for name, value in circumstances.items()}
 
 
-def marks(made: Mapping[str, Circumstances]) -> dict[str, str]:
-    """Return what of each run's circumstances differs from those of most runs, e.g. "torch, git commit", or
-    "".
+def differing_circumstances(provenance: Mapping[str, Circumstances]) -> dict[str, str]:
+    """Return, for each run, the circumstances in which it differs from most runs, e.g. "torch, git commit".
 
     Args:
-        made: the circumstances by run, in the order of the table.
+        provenance: the circumstances by run, in the order of the table.
     """
-    usual = {name: counts.most_common(1)[0][0] for name, counts in counted(made).items()}
+    usual = {name: counts.most_common(1)[0][0] for name, counts in count_circumstances(provenance).items()}
     marked = {}
-    for run, circumstances in made.items():
+    for run, circumstances in provenance.items():
         names = [name for name in usual if circumstances.get(name, UNKNOWN) != usual[name]]
-        marked[run] = ", ".join(WORDS.get(name, name) for name in names)
+        marked[run] = ", ".join(CIRCUMSTANCES.get(name, name) for name in names)
     return marked

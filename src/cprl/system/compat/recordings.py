@@ -9,16 +9,16 @@ from cprl.system.libraries import relying_on, require
 
 
 def end_recordings() -> None:
-    """Flushes and ends recordings to which nothing refers any more: until then Rerun keeps two threads and
-    the buffers of each. `rerun.init` does the same, but makes another recording."""
+    """Flush and end recordings to which nothing refers any more: until then Rerun keeps two threads and the
+    buffers of each. `rerun.init` does the same, but makes another recording."""
     with relying_on("rerun-sdk", "rerun_bindings.flush_and_cleanup_orphaned_recordings"):
         end = import_module("rerun_bindings").flush_and_cleanup_orphaned_recordings
     end()
 
 
 def keep_native(recording: Any, keep: Callable[..., object] = ctypes.pythonapi.Py_IncRef) -> None:
-    """In place of a recording's end, which waits for a viewer: its native part, the private `inner`, stays
-    until the process ends.
+    """Keep the native part of a recording, the private `inner`, until the process ends: without it, the end
+    of the recording waits for a viewer.
 
     Args:
         recording: a `rerun.RecordingStream`, as its `__del__` gets it.

@@ -14,7 +14,7 @@ require("tensordict", TensorDict({}, []), "_tensordict")
 
 
 def entry(tensordict: TensorDictBase, name: str) -> Any:
-    """`tensordict.get(name)` without its handling of nested keys; takes a tenth of the time.
+    """Return `tensordict.get(name)` ten times faster, without handling of nested keys.
 
     Raises:
         KeyError: if there is no such entry.
@@ -23,7 +23,8 @@ def entry(tensordict: TensorDictBase, name: str) -> Any:
 
 
 class Views(dict[str, Any]):
-    """The entries of a TensorDict as arrays, numpy's on the CPU, else tensors, each made when first read.
+    """The entries of a TensorDict as numpy arrays on the CPU, else as tensors; each is made when it is first
+    read.
 
     Raises:
         KeyError: if there is no such entry.
@@ -39,17 +40,18 @@ class Views(dict[str, Any]):
 
 
 def put(tensordict: TensorDictBase, name: str, value: Any) -> None:
-    """`tensordict.set(name, value)` without key handling or checks; the value must fit."""
+    """Do `tensordict.set(name, value)` without handling of keys or checks; the value must fit."""
     tensordict._set_str(name, value, validated=True, inplace=False, non_blocking=False)
 
 
 def unchecked_tensordict(
     entries: dict[str, Any], batch_size: torch.Size, device: torch.device | None = None
 ) -> TensorDict:
-    """`TensorDict(entries, batch_size, device=device)` without checks; the entries must fit, uncopied."""
+    """Return `TensorDict(entries, batch_size, device=device)` without checks or copies; the entries must
+    fit."""
     return TensorDict._new_unsafe(entries, batch_size=batch_size, device=device)
 
 
 def put_all(tensordict: TensorDict, entries: Mapping[str, Any]) -> None:
-    """`put` for several entries of a TensorDict of `unchecked_tensordict` at once."""
+    """Write several entries at once into a TensorDict of `unchecked_tensordict`, without checks."""
     tensordict._tensordict.update(entries)

@@ -38,7 +38,7 @@ class LeanStepEnv(EnvBase):
 
 
 def flag_spec(*shape: int) -> Categorical:
-    """The spec of bools with a shape [B, ...], or [B, N, ...] in a group of agents.
+    """Return the spec of bools with a shape [B, ...], or [B, N, ...] in a group of agents.
 
     `Binary` describes the same values but treats its last axis as one vector: a spec [B, N] cannot be indexed
     in a group of shape [B, N], so `EnvBase.observation_spec_unbatched` raises an IndexError.
@@ -50,19 +50,19 @@ class LaneCategorical(torch.distributions.Categorical):
     """`Categorical` for the policies of several agents in one batch, of which one may be NaN.
 
     TorchRL's PPO losses replace the entropies of the whole batch by samples if one of them is not finite, and
-    torch refuses to sample from NaN, on a GPU for the rest of the process. Here NaN has entropy 0 and is
-    sampled uniformly; the log-probabilities, and so that agent's loss, stay NaN. Nothing else differs.
+    torch refuses to sample from NaN, on a GPU for the rest of the process. Here a policy of NaN has entropy 0
+    and is sampled uniformly; the log-probabilities, and so that agent's loss, stay NaN. Nothing else differs.
     """
 
     def entropy(self) -> torch.Tensor:
-        """As of `Categorical`, and 0 for NaN."""
+        """Return the entropy, 0 for NaN."""
         entropy: torch.Tensor = super().entropy()  # type: ignore[no-untyped-call]
         # Compiled losses take a sample, and so the log-probability of one, where the entropy is NaN.
         return entropy if torch.compiler.is_compiling() else entropy.nan_to_num(nan=0.0)
 
     def sample(self, sample_shape: Any = ()) -> torch.Tensor:
-        """As of `Categorical`, and uniform for NaN; in compiled losses, which sample in every case and look
-        at samples of NaN alone, always 0."""
+        """Return samples, uniform for NaN; in compiled losses, which sample in every case and look at samples
+        of NaN alone, always 0."""
         size = torch.Size(sample_shape)
         if torch.compiler.is_compiling():
             return self.probs.new_zeros(self._extended_shape(size), dtype=torch.int64)
@@ -71,7 +71,7 @@ class LaneCategorical(torch.distributions.Categorical):
 
 
 def entropy_by_formula(loss: LossModule) -> None:
-    """Makes a PPO loss take the entropy of its policy as the distribution computes it.
+    """Make a PPO loss take the entropy of its policy as the distribution computes it.
 
     TorchRL's asks whether the entropies of the whole batch are finite, to sample otherwise; a question that
     torch cannot vmap. A loss with another entropy, or a policy without a formula, stays as it is.
@@ -89,8 +89,8 @@ def entropy_by_formula(loss: LossModule) -> None:
 
 
 class ReshapedLoss:
-    """Of a `LossModule` whose losses of single transitions pass through a function before they are weighed
-    and reduced; stands before the loss among the bases.
+    """A mixin for a `LossModule` that applies a function to the loss of each transition before weighting and
+    reduction. List it before the loss among the base classes.
 
     TorchRL's losses know their distances by name, see `torchrl.objectives.utils.distance_loss`, and hand what
     those give to the private `LossModule._reduce_loss`, which this class overrides. The loss must call it
@@ -98,7 +98,7 @@ class ReshapedLoss:
     """
 
     def reshape_each(self, losses: torch.Tensor) -> torch.Tensor:
-        """The function, of any shape."""
+        """Apply the function to losses of any shape."""
         raise NotImplementedError
 
     def _reduce_loss(self, loss: torch.Tensor, **options: Any) -> Any:
@@ -106,12 +106,12 @@ class ReshapedLoss:
 
 
 def updated_weights(loss: LossModule) -> list[str]:
-    """The names of the weights whose targets a TorchRL target updater updates."""
+    """Return the names of the weights whose targets a TorchRL target updater updates."""
     return [name for name, is_updated in _targets_of(loss).items() if is_updated]
 
 
 def refuse_updaters(loss: LossModule, message: str) -> None:
-    """Makes a loss refuse TorchRL's target updaters, which read the names of its targets first."""
+    """Make a loss refuse TorchRL's target updaters, which read the names of its targets first."""
     loss._has_update_associated = _Refusing(_targets_of(loss), message)
 
 
@@ -127,7 +127,7 @@ class _Refusing(dict[str, bool]):
 
 
 def promise_targets(loss: LossModule) -> None:
-    """Marks the targets of a loss as updated: it would warn that they have no TorchRL updater, while
+    """Mark the targets of a loss as updated, so that it does not warn about a missing TorchRL updater;
     `LaneNetworks.copy_to_targets` updates them."""
     targets = _targets_of(loss)
     for name in targets:
@@ -135,12 +135,12 @@ def promise_targets(loss: LossModule) -> None:
 
 
 def _targets_of(loss: LossModule) -> dict[str, bool]:
-    """By the names of weights that have targets, whether a TorchRL updater updates these."""
+    """Return whether a TorchRL updater updates the targets of weights, by the names of these weights."""
     with relying_on("torchrl", "LossModule._has_update_associated"):
         targets: dict[str, bool] = loss._has_update_associated
     return targets
 
 
 def forget_cached_weights(loss: LossModule) -> None:
-    """Clears the detached weights that some losses cache at a call, so that they can be replaced."""
+    """Clear the detached weights that some losses cache at a call, so that they can be replaced."""
     loss.__dict__.pop("_cache", None)
