@@ -21,8 +21,12 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    # Processes that tests start import from the same folders as the tests.
-    folders = [str(path) for path in config.getini("pythonpath") if path.is_relative_to(TESTS)]
+    # Processes that tests start import what tests share, which imports examples of own algorithms.
+    folders = [
+        str(path)
+        for path in config.getini("pythonpath")
+        if path.is_relative_to(TESTS) or path.name == "own_algorithm"
+    ]
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [*folders, os.environ.get("PYTHONPATH", "")]))
     if config.getoption("--plain"):
         os.environ[RULES_VARIABLE] = PLAIN_RULES

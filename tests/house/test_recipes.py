@@ -94,10 +94,11 @@ def test_the_comparison_of_learners_takes_the_candidates_that_got_most_and_were_
 @pytest.mark.integration
 def test_agents_of_a_study_of_learners_meet_in_a_cross_play(tmp_path, monkeypatch, of_learners):
     ways = of_learners("ways")
-    candidates = {name: ways.WAYS[name].candidates(1000).values() for name in ("DQN", "MAPPO")}
+    candidates = {name: ways.candidates(name, 1000).values() for name in ("DQN", "MAPPO")}
     algorithms = {name: next(iter(algorithms)) for name, algorithms in candidates.items()}
     options = {"name": "few", "question": "", "expectation": "", "replicas": 2}
-    study = ways.study("two_complex", algorithms, episodes=2, evaluation_episodes=1, **options)
+    length = {"episodes": 2, "evaluation_episodes": 1}
+    study = ways.study("two_complex", algorithms, length, **options)
     eager = replace(study, experiment=replace(study.experiment, engine="eager"))
     cprl.run_study(eager, tmp_path / "few", results=False, progress=False)
     cross_play = of_learners("cross_play")
@@ -215,6 +216,8 @@ def test_two_agents_without_the_beam_never_fire(tmp_path):
     ],
 )
 def test_swapping_the_loss_is_one_argument_and_each_leaves_a_run_that_plays_again(loss, tmp_path, capsys):
+    if loss in ("cql", "iql"):  # examples of an algorithm of one's own
+        cprl.trust(f"{loss}:{loss.upper()}")
     episodes = 5 if loss == "ppo" else 1  # a rollout is longer than an episode is here
     run = run_recipe("swap_the_loss", tmp_path / "run", own={"loss": loss}, episodes=episodes, watch="off")
     loaded, algorithm = cprl.load(run), recipe("swap_the_loss").LOSSES[loss]
@@ -370,7 +373,7 @@ def test_the_tragedy_ends_with_what_happened_and_what_to_try_next(tmp_path, caps
     own = recipe("tragedy")
     words = ["recipes/tragedy.py", "--out", str(tmp_path / "run"), "--engine", "eager", "--watch", "off"]
     words += ["--episodes", "12", "--replicas", "2", "--evaluation-episodes", "2"]
-    run = cprl.recipe_main(own.experiment, words, at_end=own.tell)
+    run = cprl.recipe_main(own.experiment, words, at_end=own.print_next)
     told = capsys.readouterr().out
     before, after = told[: told.index("survival, steps")], told[told.index("Training curve:") :]
     assert "The agents began at" in before

@@ -376,7 +376,7 @@ def test_what_compiled_pieces_of_a_rollout_say_is_what_the_networks_say():
     actors, critics = (partial(compiled.lane_networks.outputs, part=part) for part in (0, 1))
     by_networks = actors(seen), critics(seen), critics(following)
     torch.testing.assert_close(
-        compiled.memory._evaluated(compiled.lane_networks), by_networks, rtol=1e-4, atol=1e-5
+        compiled.memory._evaluate(compiled.lane_networks), by_networks, rtol=1e-4, atol=1e-5
     )
     torch.testing.assert_close(compiled.update(), eager.update(), rtol=1e-4, atol=1e-5)
 

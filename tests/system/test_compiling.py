@@ -323,7 +323,7 @@ def test_closures_are_constants_too(compilations):
 @pytest.mark.integration
 def test_shared_code_that_gives_other_numbers_is_given_up(compilations, monkeypatch):
     """As a second line of defence: with guards that let everything through."""
-    monkeypatch.setattr(compiling, "fits", lambda *_: True)
+    monkeypatch.setattr(compiling, "guards_hold", lambda *_: True)
     assert shared_call(Owner()) == [4.0] * 3
     assert shared_call(Owner(3.0)) == [6.0] * 3
     assert len(compilations) == 2
