@@ -61,11 +61,13 @@ class Expectation:
 
     label: str
     more: Sequence[str]
-    """The conditions whose mean counts positively."""
+    """The conditions whose mean counts positively; "STUDY/CONDITION" is one of another study."""
     less: Sequence[str]
     sign: Sign
     why: str
     metric: str = "income"
+    part: Literal["evaluation", "training"] = "evaluation"
+    """Frozen in fresh worlds, or the last episodes of the training, in which agents learn."""
 
 
 def game_with(base: Game = GAME, **rules: Any) -> Game:
