@@ -17,13 +17,16 @@ The rules, set before any of these studies ran:
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Final, Literal
 
 import cprl
 from cprl import presets
 from cprl.algorithms import DQN, DQNSettings
 from cprl.commons.game import Game
-from cprl.population import Learning
+from cprl.population import Frozen, Learning
+from cprl.studies import Study
+from cprl.studies.trials import trials_of
 
 WORLDS: Final = 16
 STEPS: Final = 400_000
@@ -68,6 +71,15 @@ class Expectation:
     metric: str = "income"
     part: Literal["evaluation", "training"] = "evaluation"
     """Frozen in fresh worlds, or the last episodes of the training, in which agents learn."""
+    margin: float = MARGIN
+
+
+def trained(study: Study, condition: str) -> tuple[Frozen, ...]:
+    """Return the agents of a condition that was trained before, in the default directory of its study."""
+    runs = Path("studies", study.name, "runs")
+    (run,) = (trial.directory for trial in trials_of(study, runs) if trial.condition.name == condition)
+    game = next(each.experiment.game for each in study.all_conditions if each.name == condition)
+    return tuple(Frozen(str(run), agent, replica=None) for agent in range(game.agents))
 
 
 def game_with(base: Game = GAME, **rules: Any) -> Game:

@@ -3,8 +3,8 @@
     python recipes/study/governs/thresholds.py
 
 Restrained agents ("sustainable") and greedy ones play `commons` in all mixes. A tax at the rate t of each
-bite, shared by N agents, leaves an agent (1 - t) of its harvest and gives it t of the mean. So both thresholds
-are where a line crosses 0: greed, where a lone greedy agent among restrained ones gets what it would get by
+bite, shared by N agents, leaves an agent (1 - t) of its harvest and gives it t of the mean. So both are where
+a line crosses 0: greed, where a lone greedy agent among restrained ones gets what it would get by
 restraint, and fear, where a lone restrained agent among greedy ones gets what it would get by greed. Writes
 docs/results/governs/thresholds.md, to be run in the root of the repository; half a minute of a core.
 """
