@@ -39,7 +39,7 @@ COMPARED: Final = (*REPORTED, "commons", "commons_decay_500k", "commons_publishe
 APRIL_RANDOM_PLAY: Final = 99.24
 """What random play harvested under the fault of 10 April 2019, in apples; see docs/results/details.md."""
 
-sys.path[:0] = [str(STUDY), str(STUDY / "theory")]
+sys.path[:0] = [str(STUDY), str(STUDY / "theory"), str(STUDY / "governs")]
 
 
 def draw_boards() -> None:
@@ -52,10 +52,10 @@ def draw_boards() -> None:
 def draw_institutions() -> None:
     """Draw each institution at work, and what all of them do to the tragedy."""
     from draw_institutions import draw_institutions
-    from institutions_table import draw
+    from institutions_page import draw_courses
 
     draw_institutions()
-    draw(RESULTS / "institutions", DOCS / "institutions")
+    draw_courses(RESULTS / "studies", DOCS / "institutions" / "courses.png")
 
 
 def draw_theory() -> None:
@@ -76,9 +76,10 @@ def draw_theory() -> None:
 
 def draw_governs() -> None:
     """Draw what governs the commons."""
-    from governs import draw, rows
+    from figure import PICTURES, draw
 
-    draw(rows(), RESULTS / "governs" / "governs.png")
+    for name, groups in PICTURES.items():
+        draw(RESULTS / "governs" / name, groups)
 
 
 def draw_studies() -> None:
@@ -168,7 +169,7 @@ def draw_film() -> None:
     with TemporaryDirectory() as scratch:
         drawn = Path(scratch, "tragedy.gif")
         look = ["--every", "5", "--width", "560", "--out", str(drawn)]
-        run_cprl("film", str(RESULTS / "commons"), "--replica", "7", "--episode", "1", *look)
+        run_cprl("film", str(RESULTS / "commons_published"), "--replica", "1", "--episode", "0", *look)
         shutil.copyfile(drawn, DOCS / "tragedy.gif")
 
 

@@ -1,17 +1,15 @@
 """The pages and moving boards of docs/gallery.md, of runs of recipes/institutions.py.
 
 for name in none quota boundaries graduated_sanctions monitoring vote mediation sanctioner levies; do
-    python recipes/institutions.py --institution $name --replicas 1 --watch off --out runs/$name
+    python recipes/institutions.py --institution $name --watch off --out runs/$name
 done
 python docs/draw_gallery.py --runs runs
 
-The committed pictures of none and quota are replica 0 of runs with 16 replicas, without `--replicas 1`.
 Without `--runs` the pages are made again of the episodes that they hold, in the words of today.
 """
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 from runpy import run_path
 from types import SimpleNamespace
@@ -21,7 +19,7 @@ import tyro
 
 from cprl import Experiment
 from cprl.evaluation.film_pictures import write_gif
-from cprl.evaluation.fresh import fresh_episode, record
+from cprl.evaluation.fresh import fresh_episodes, record
 from cprl.evaluation.populations import commons_game
 from cprl.evaluation.show import about, begins, page, show
 from cprl.pictures.image import world_image
@@ -50,12 +48,9 @@ def with_new_words(text: str, experiment: Experiment) -> str:
         re.findall(r'id="data" type="application/json">(.*?)</script>', text)[0]
     )
     (population,) = data["populations"]
-    (replicas,) = re.findall(r"in (\d+) replica", population["about"])
-    experiment = replace(experiment, replicas=int(replicas))
     game: Any = experiment.game
     specs = specs_by_agent(experiment.agents, game.agents)
     run: Any = SimpleNamespace(experiment=experiment, game=game, specs=specs, networks=specs)
-    population["which"] = "Replica 0, episode 0."
     population["about"] = about(run)
     data["axis"] = population["turns"] - 1
     data["legend"] = legend_of([game])
@@ -81,7 +76,7 @@ def main(*, runs: Path | None = None, out: Path = Path(__file__).parent / "galle
         path = out / f"{name}.html"
         path.unlink(missing_ok=True)
         show(runs / name, path, titles=[title])
-        fresh = fresh_episode(runs / name)
+        (fresh,) = fresh_episodes([runs / name])
         moments = record(fresh).boards
         shown = [*moments[::EVERY], moments[-1]]
         board = commons_game(fresh.run).map

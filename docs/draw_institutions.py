@@ -21,6 +21,7 @@ from institution_pictures import (
     show_board,
     stock_lines,
 )
+from published_figures import on_white
 
 from cprl import Game, Rules, maps
 from cprl.commons.near import patches, sites_around
@@ -39,7 +40,7 @@ from cprl.institutions import (
     Tax,
     Vote,
 )
-from cprl.terminal.style import MARK, MEAN, RAW, Sheet, drawing, on_white
+from cprl.terminal.style import MARK, MEAN, RAW, Sheet, drawing
 
 FOLDER: Final = Path(__file__).parent / "institutions"
 NO_RULE: Final = Tax(rate=0.0)

@@ -1,9 +1,9 @@
 """The tragedy of the commons under rules that people make: Ostrom's eight principles, one at a time.
 
-    python recipes/institutions.py --institution quota         16 replicas of 200 episodes
+    python recipes/institutions.py --institution quota         8 replicas of 16 worlds, 400,000 steps
 
-Four independent DQN agents on `commons`, in one world of each replica, on a schedule twenty times shorter
-than the published one, under one institution or under none. docs/institutions.md compares them.
+Four independent DQN agents on `commons`, by the published rules, under one institution or under none, on the
+schedule of recipes/tragedy.py. docs/institutions.md compares them.
 Copy this file and change it: another institution, or several together, is one line.
 """
 
@@ -27,8 +27,17 @@ from cprl.institutions import (
 )
 from cprl.population import Learning
 
-SHORT = {"learning_rate": 1e-4, "epsilon_decay_steps": 100_000, "gamma": 0.95}
-"""The differences from the published schedule, as in recipes/study/base.py."""
+WORLDS = 16
+SETTINGS = replace(
+    presets.dqn_settings("commons"),
+    learning_rate=1e-3,
+    gamma=0.97,
+    batch_size=64,
+    steps_per_update=WORLDS,  # so one update a turn
+    epsilon_decay_steps=100_000,
+    target_every_updates=250,
+)
+"""The published settings but for what is said here."""
 
 Choice = Literal[
     "none",
@@ -42,22 +51,20 @@ Choice = Literal[
     "levies",
 ]
 
-SHARE = 0.25
-WINDOW = 50
-"""The share and the window of every quota here: a quarter of the map's proven yield, counted in windows of 50
-turns: 6.9 apples per agent and window, of which an agent may take 6."""
+QUOTA = Quota(share=0.25, window_steps=50)
+"""A quarter of the map's proven yield: 6.9 apples per agent in 50 turns, of which an agent may take 6."""
 
 INSTITUTIONS: dict[Choice, tuple[Institution, ...]] = {
     "none": (),
     "boundaries": (Boundaries.strips(height=12, width=24, agents=4),),
-    "quota": (Quota(share=SHARE, window_steps=WINDOW),),
+    "quota": (QUOTA,),
     "vote": (Vote(on=Tax(), choices=(0.0, 0.25, 0.5, 0.75)),),
-    "monitoring": (Quota(share=SHARE, window_steps=WINDOW, fine=2.0), Monitoring(prob=0.5)),
+    "monitoring": (replace(QUOTA, fine=2.0), Monitoring(prob=0.5)),
     "graduated_sanctions": (
-        Quota(share=SHARE, window_steps=WINDOW, fine=0.0),
+        replace(QUOTA, fine=0.0),
         GraduatedSanctions(freeze_steps=(5, 25, 100, 100), fines=(0, 1, 2, 4), recovery_steps=50),
     ),
-    "mediation": (Quota(share=SHARE, window_steps=WINDOW, fine=0.0), Mediation(turns=WINDOW, refund=1.0)),
+    "mediation": (replace(QUOTA, fine=0.0), Mediation(turns=50, refund=1.0)),
     "sanctioner": (Sanctioner(),),
     "levies": (Levies(groups=((0, 1), (2, 3)), local_rate=0.3, joint_rate=0.2),),
 }
@@ -70,9 +77,8 @@ def experiment(*, institution: Choice = "none") -> cprl.Experiment:
     Args:
         institution: which one, by its name.
     """
-    game = presets.game("commons", variant="as_run")
+    game = presets.game("commons")
     apart = any(isinstance(rule, Mediation) for rule in INSTITUTIONS[institution])
-    settings = replace(presets.dqn_settings("commons", variant="as_run"), **SHORT)
     return cprl.Experiment(
         name=f"institutions_{institution}",
         game=replace(
@@ -80,9 +86,10 @@ def experiment(*, institution: Choice = "none") -> cprl.Experiment:
             observation=replace(game.observation, agents_apart=apart),
             institutions=INSTITUTIONS[institution],
         ),
-        agents=(Learning(DQN(settings=settings)),) * 4,
-        episodes=200,
-        replicas=16,
+        agents=(Learning(DQN(settings=SETTINGS)),) * 4,
+        steps=400_000,
+        replicas=8,
+        worlds=WORLDS,
         evaluation_episodes=50,
     )
 

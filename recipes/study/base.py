@@ -1,8 +1,8 @@
-"""The experiments that the studies of this folder vary: the tragedy of the commons, on three schedules.
+"""The experiments that the studies of the game as run vary: the tragedy of the commons, on three schedules.
 
 Four independent DQN agents on `commons`, by the rules of the study as run: `EXPERIMENT`, 200 episodes of 8
-replicas in one world each on a schedule twenty times shorter than the published one; `TRAGEDY`, that of
-recipes/tragedy.py, which learns from sixteen worlds; and `PUBLISHED`, experiment 5 as run.
+replicas in one world each on a schedule twenty times shorter than the published one; `TRAGEDY`, which learns
+from sixteen worlds, as recipes/tragedy.py does by the published rules; and `PUBLISHED`, experiment 5 as run.
 """
 
 from dataclasses import replace

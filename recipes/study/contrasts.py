@@ -1,41 +1,59 @@
-"""What do the pages compare that no summary of a study does? Frozen beside learning, and planned contrasts.
+"""What do the pages compare that no summary of a study does? Other settings, and planned contrasts.
 
     python recipes/study/contrasts.py
 
-To be run in the root of the repository: reads tables in docs/results, and writes
-docs/results/governs/contrasts.md. "While learning" is the mean of the last 30 episodes of a training, in
-which agents explore and their weights change after every turn; "frozen" that of fresh episodes of the same
-agents at its end, whose weights no longer change and who explore half as much. A contrast is the mean of some
-conditions minus that of others, in each replica.
+To be run in the root of the repository: reads tables in docs/results, and writes into docs/results/governs
+contrasts.md, and elsewhere.md, what each change of elsewhere.py adds. "While learning" is the mean of the
+last 30 episodes of a training, in which agents explore and their weights change after every turn; "frozen"
+that of fresh episodes of the same agents at its end, whose weights no longer change and who explore half as
+much. A contrast is the mean of some conditions minus that of others, in each replica.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final, Literal, NamedTuple
 
 import numpy as np
 import tyro
-from governs import RESULTS, Part, values_of
 from page import table
-from together import design, name
 
-from cprl.measuring.statistics import Estimate, difference, estimate
+from cprl.measuring.registry import METRICS
+from cprl.measuring.statistics import Estimate, difference, estimate, judge_family
+from cprl.studies import StudyTable
+from cprl.studies.tables.comparing import values_of as replicas_of
+from cprl.values.array_types import Float64
 
-LEARNERS: Final = "../learners/commons"
-SIDE_BY_SIDE: Final = {
-    "none": ("best_rules", "none"),
-    "quota by hand": ("best_rules", "quota, by hand"),
-    "best quota found": ("best_rules", "quota, best found"),
-    "sanctions by hand": ("best_rules", "sanctions, by hand"),
-    "best sanctions found": ("best_rules", "sanctions, best found"),
-    "tax by hand": ("best_rules", "tax, by hand"),
-    "best tax found": ("best_rules", "tax, best found"),
-    "DQN, 1 world": ("many_worlds", "DQN, as run, 1 world"),
-    "DQN, 16 worlds": ("many_worlds", "DQN, as run, 16 worlds"),
-    "PPO, 1 world": ("many_worlds", "PPO, as run, 1 world"),
-    "PPO, 16 worlds": ("many_worlds", "PPO, as run, 16 worlds"),
-}
-"""The conditions that are shown frozen beside learning: the study and its name there."""
+RESULTS: Final = Path("docs", "results")
+LAST: Final = 30
+"""Episodes at the end of each replica."""
+LONGER: Final = {"PPO, 256 worlds": 256, "DQN, full schedule": 1_000}
+"""Episodes at the end, by setting of elsewhere.py: one of each world, since the last 30 of 256 worlds are the
+longest ones; and as many as agents need that go up and down over hundreds, chosen after the last 30 were
+seen."""
+UNCHANGED: Final = "nothing changed"
+
+Part = Literal["training", "evaluation"]
+
+
+@cache
+def table_of(study: str) -> StudyTable:
+    """Return the committed table of a study."""
+    return StudyTable.read(RESULTS / "studies" / study / "table.parquet")
+
+
+@cache
+def _by_condition(study: str, metric: str, part: Part, last: int) -> Mapping[str, Mapping[int, float]]:
+    return replicas_of(table_of(study).windows(part, last=last), metric)
+
+
+def values_of(study: str, condition: str, metric: str, part: Part = "training", last: int = LAST) -> Float64:
+    """Return a metric of each replica; "income" is the income, and without money the harvest."""
+    values = _by_condition(study, metric, part, last).get(condition)
+    same_as = METRICS[metric].same_as
+    if not values and same_as is not None:
+        values = _by_condition(study, same_as, part, last)[condition]
+    return np.array(list(values.values()))
 
 
 class Contrast(NamedTuple):
@@ -46,7 +64,7 @@ class Contrast(NamedTuple):
     metric: str
     more: Sequence[str]
     less: Sequence[str]
-    last: int = 30
+    last: int = LAST
     """Episodes at the end of the training."""
 
     def difference(self, part: Part) -> Estimate:
@@ -58,37 +76,10 @@ class Contrast(NamedTuple):
         return difference(*means, paired=True)
 
 
-TITLES: Final = {
-    "income": "income",
-    "survival_steps": "survival, turns",
-    "income_equality": "equality of income",
-}
-
-
-def with_rule(factor: str, metric: str, *, is_there: bool) -> Contrast:
-    """Return a factor of together.py in the combinations that have a quota or boundaries, or in the others,
-    where monitoring and sanctions are not in the game."""
-    cells = [levels for levels in design() if (levels["quota"] or levels["boundaries"]) == is_there]
-    where = "where there is a quota or boundaries" if is_there else "where there is neither"
-    more = [name(levels) for levels in cells if levels[factor]]
-    less = [name(levels) for levels in cells if not levels[factor]]
-    return Contrast(f"{factor} {where}, {TITLES[metric]}", "together", metric, more, less)
-
-
-TAX: Final = ["tax, best found"]
-BY_HAND: Final = ["quota, by hand"]
+LEARNERS: Final = "../learners/commons"
 EQUALITY: Final = "income_equality"
 HARVEST: Final = "collective_return"
 CONTRASTS: Final = [
-    with_rule("sanctions", "income", is_there=True),
-    with_rule("monitoring", "income", is_there=True),
-    with_rule("sanctions", "survival_steps", is_there=True),
-    with_rule("monitoring", "survival_steps", is_there=True),
-    with_rule("sanctions", "income", is_there=False),
-    with_rule("monitoring", "income", is_there=False),
-    Contrast("best tax - quota by hand, income", "best_rules", "income", TAX, BY_HAND),
-    Contrast("best tax - quota by hand, equality of income", "best_rules", EQUALITY, TAX, BY_HAND),
-    Contrast("best tax - best quota, equality of income", "best_rules", EQUALITY, TAX, ["quota, best found"]),
     Contrast(
         "three teams - three that learn alone",
         LEARNERS,
@@ -114,15 +105,15 @@ CONTRASTS: Final = [
     ),
     *(
         Contrast(
-            f"full schedule, {change} - nothing changed, {TITLES[metric]}, last 1,000",
+            f"full schedule, {change} - {UNCHANGED}, {title}, last 1,000",
             "elsewhere",
             metric,
             [f"DQN, full schedule: {change}"],
-            ["DQN, full schedule: nothing changed"],
+            [f"DQN, full schedule: {UNCHANGED}"],
             1_000,
         )
         for change in ("quota", "penalty that is certain")
-        for metric in (EQUALITY, "survival_steps")
+        for metric, title in ((EQUALITY, "equality of income"), ("survival_steps", "survival, turns"))
     ),
     Contrast(
         "Melting Pot, quota - twice the apples, income",
@@ -135,28 +126,8 @@ CONTRASTS: Final = [
 """All that the pages name."""
 
 
-def side_by_side() -> list[str]:
-    """Return the conditions that are shown frozen beside learning, in Markdown."""
-    head = ["condition", "income while learning, apples", "income frozen", "frozen - while learning"]
-    head += ["equality of the harvest, frozen", "equality of income, frozen"]
-    rows = []
-    for label, place in SIDE_BY_SIDE.items():
-        learning = values_of(*place, "income")
-        frozen = values_of(*place, "income", "evaluation")
-        change = difference(frozen, learning, paired=True)
-        equalities = [
-            str(estimate(values_of(*place, metric, "evaluation"))) for metric in ("equality", EQUALITY)
-        ]
-        rows.append([label, str(estimate(learning)), str(estimate(frozen)), f"{change:+}", *equalities])
-    return table(head, rows, numbers=5)
-
-
-def main(*, out: Path = RESULTS / "governs" / "contrasts.md") -> None:
-    """Write the tables.
-
-    Args:
-        out: the file.
-    """
+def contrasts() -> list[str]:
+    """Return the contrasts in Markdown."""
     rows = []
     for contrast in CONTRASTS:
         cells = [contrast.label]
@@ -164,16 +135,70 @@ def main(*, out: Path = RESULTS / "governs" / "contrasts.md") -> None:
             change = contrast.difference(part)
             cells += [f"{change:+}", f"{change.p_value:.2g}"]
         rows.append(cells)
-    lines = [
+    return [
         "By `python recipes/study/contrasts.py`, which says what the columns mean.",
         "",
-        *side_by_side(),
         "Each p is of one comparison, not corrected for the others. Of learners and of many worlds the "
         "harvest is compared, in apples.",
         "",
         *table(["contrast", "while learning", "p", "frozen", "p"], rows, numbers=4),
     ]
-    out.write_text("\n".join(lines), encoding="utf-8")
+
+
+def elsewhere() -> list[str]:
+    """Return tables in Markdown of what each change adds by setting, and how many times the income it
+    gives."""
+    longer = "While learning, longer ends: 256 episodes of PPO, 1,000 of the full schedule:"
+    return [
+        "Income, apples, and what each change adds, paired by replica.",
+        "Stars: not 0 by Holm's method for the 24 changes of a table together.",
+        "",
+        *("While learning, the last 30 episodes:", "", *elsewhere_table("training", {})),
+        *(longer, "", *elsewhere_table("training", LONGER)),
+        *("Frozen, in fresh worlds:", "", *elsewhere_table("evaluation", {})),
+    ]
+
+
+def elsewhere_table(part: Part, last: Mapping[str, int]) -> list[str]:
+    """Return a table of what each change adds by setting."""
+    names = [name.partition(": ") for name in table_of("elsewhere").design.conditions]
+    settings = list(dict.fromkeys(setting for setting, _, _ in names))
+    changes = [change for change in dict.fromkeys(change for _, _, change in names) if change != UNCHANGED]
+    bases = []
+    pairs = []
+    for setting in settings:
+        episodes = last.get(setting, LAST)
+        base, *others = (
+            values_of("elsewhere", f"{setting}: {change}", "income", part, episodes)
+            for change in (UNCHANGED, *changes)
+        )
+        mean = estimate(base)
+        bases.append(f"{mean.value:,.0f} [{mean.low:,.0f}, {mean.high:,.0f}]")
+        pairs += [(income, base) for income in others]
+    texts = change_texts(pairs)
+    lines = [[UNCHANGED, *bases]]
+    lines += [[change, *texts[place :: len(changes)]] for place, change in enumerate(changes)]
+    return table(["apples", *settings], lines, numbers=len(settings))
+
+
+def change_texts(pairs: Sequence[tuple[Float64, Float64]]) -> list[str]:
+    """Return the difference of each, paired by replica, and the ratio; stars by Holm's method for all of
+    these."""
+    changes = {(str(place),): difference(*pair, paired=True) for place, pair in enumerate(pairs)}
+    texts = []
+    for change, (value, base) in zip(judge_family(changes).values(), pairs, strict=True):
+        texts.append(f"{change:+}{'*' * change.differs}, x {value.mean() / base.mean():.1f}")
+    return texts
+
+
+def main(*, out: Path = RESULTS / "governs") -> None:
+    """Write the tables.
+
+    Args:
+        out: the directory.
+    """
+    for name, lines in {"contrasts": contrasts(), "elsewhere": elsewhere()}.items():
+        (out / f"{name}.md").write_text("\n".join(lines), encoding="utf-8")
 
 
 if __name__ == "__main__":

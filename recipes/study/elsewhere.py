@@ -2,10 +2,11 @@
 
     python recipes/study/elsewhere.py --jobs 2
 
-The changes with the strongest effects of docs/governs.md in four settings: four DQN agents on `commons` that
-learn from sixteen worlds (the schedule of recipes/tragedy.py), four PPO agents that learn from 256 (the
-settings of recipes/study/many_worlds.py), seven DQN agents on Melting Pot's open commons, in sixteen, and
-experiment 5 as run, on its full schedule of 4,800 episodes in one world, which takes most of the time.
+The changes that had the strongest effects on a short schedule (docs/governs.md of commit e2b73286) in four
+settings: four DQN agents on `commons` as run that learn from sixteen worlds (TRAGEDY of base.py), four PPO
+agents that learn from 256 (the settings of recipes/study/many_worlds.py), seven DQN agents on Melting Pot's
+open commons, in sixteen, and experiment 5 as run, on its full schedule of 4,800 episodes in one world, which
+takes most of the time. recipes/study/contrasts.py makes tables of what each change adds.
 """
 
 from dataclasses import replace
@@ -14,17 +15,17 @@ from typing import Any, Final
 
 import numpy as np
 from base import PUBLISHED, TRAGEDY
-from best_rules import QUOTA
 from many_worlds import ppo
-from space import scattered
 
 import cprl
-from cprl import Game, Map, presets
+from cprl import Game, Map, maps, presets
 from cprl.algorithms import DQN, PPO
+from cprl.institutions import Quota
 from cprl.population import Learning
 
 COMMONS: Final = TRAGEDY.game
 OPEN: Final = presets.game("melting_pot/commons_harvest__open-v1")
+QUOTA: Final = Quota(share=0.25, window_steps=50)
 PENALTY: Final = replace(QUOTA, fine=2.0)
 """A fine that is certain, and twice what the bite brings."""
 
@@ -42,6 +43,12 @@ SETTINGS: Final[dict[str, tuple[Game, DQN | PPO, dict[str, Any]]]] = {
 """By name: the game, how each agent learns, and from how much."""
 
 
+def scattered(board: Map) -> Map:
+    """Return a random board of this size with twice the sites."""
+    density = 2 * len(board.sites) / (board.height * board.width)
+    return maps.random(board.height, board.width, agents=len(board.starts), density=density, seed=0)
+
+
 def denser(board: Map) -> Map:
     """Return the board with as many further sites as it has, on free ground by chance."""
     starts = {(row, col) for row, col, _ in board.starts}
@@ -55,7 +62,7 @@ def games(game: Game) -> dict[str, Game]:
     """Return the game under each change of it."""
     half = game.agents // 2
     fewer = replace(game.map, starts=game.map.starts[:half])
-    richer = scattered(2) if game is COMMONS else denser(game.map)
+    richer = scattered(game.map) if game is COMMONS else denser(game.map)
     regrow = tuple(min(1.0, 2 * prob) for prob in game.rules.regrow_prob)
     return {
         "nothing changed": game,

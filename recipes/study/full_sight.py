@@ -2,18 +2,18 @@
 
     python recipes/study/full_sight.py --jobs 2 --block 4
 
-In recipes/study/view.py, 200 episodes in one world, agents with full sight get what random play gets. Here
-they learn for 2,000 episodes, from sixteen worlds at once.
+In 200 episodes in one world agents with full sight get what random play gets. Here they learn for 2,000
+episodes, from sixteen worlds at once.
 """
 
 from dataclasses import replace
 
-from best_rules import experiment
+from base import TRAGEDY
 
 import cprl
 
 STUDY = cprl.Study(
-    replace(experiment(), episodes=2000),
+    replace(TRAGEDY, episodes=2000),
     {"view": {"7 x 15": {}, "full board": {"game.observation.area": "full"}}},
     replicas=8,
     reference="view=7 x 15",

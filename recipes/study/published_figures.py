@@ -9,6 +9,7 @@ import numpy as np
 from claims import undefined_text
 from matplotlib.axes import Axes
 from matplotlib.patches import Rectangle
+from matplotlib.patheffects import Normal, Stroke
 from phases import PHASES, PHASES_BEGIN, UNNAMED, Phase, training_phases
 from published import EXPERIMENT_5
 from random_play import random_returns
@@ -16,6 +17,7 @@ from results import Result
 
 from cprl.measuring.registry import title, unit
 from cprl.measuring.statistics import curve_interval
+from cprl.pictures.colours import agent_colour
 from cprl.terminal import style
 from cprl.terminal.figures import mark_exploration
 from cprl.values.array_types import Float64
@@ -33,6 +35,10 @@ MARGIN: Final = 0.04
 """Empty room above and below all curves, as a share of their range."""
 MOST_BOLD: Final = 4
 """Replicas whose curves can be told apart; those of more are fainter."""
+INTERVAL: Final = "#4292c6"
+"""The colour of intervals over replicas."""
+AGENTS_OF_A_DASH: Final = 4
+"""The number of agents with the same line style, which have different colours."""
 
 Bands = Sequence[tuple[float, float, str]]
 """First episode, last episode and name of each phase."""
@@ -172,16 +178,28 @@ def _draw_strip(sheet: style.Sheet, panel: Axes, axes: Axes, rows: Mapping[str, 
     panel.spines[:].set_visible(False)
 
 
+def on_white(agent: int) -> dict[str, Any]:
+    """Return the style of an agent's line on a white background: its colour with a dark edge.
+
+    The edge makes light colours such as yellow visible. Agents 4 and on also have dashes, because their
+    colours repeat.
+    """
+    red, green, blue = agent_colour(agent)
+    edge = [Stroke(linewidth=3.2, foreground="#303030"), Normal()]
+    dashes = style.DASHES[agent // AGENTS_OF_A_DASH % len(style.DASHES)]
+    return {"color": (red / 255, green / 255, blue / 255), "path_effects": edge, "linestyle": dashes}
+
+
 def _draw_curves(axes: Axes, smoothed: Float64, metric: str) -> None:
     """Draw each replica, [R, E], their mean and its interval; an agent's return in the agent's colour."""
     middle, low, high = curve_interval(smoothed)
     replicas = len(smoothed)
     bold: dict[str, Any] = {"color": style.MEAN}
     faint = style.REPLICA
-    wide = style.INTERVAL
+    wide = INTERVAL
     agent = metric.removeprefix("return_")
     if agent.isdecimal():
-        bold = style.on_white(int(agent))
+        bold = on_white(int(agent))
         faint = wide = style.RAW
     marker = "." if len(middle) < 3 else None  # a line needs two points
     label = "ours, one replica"

@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from cprl.commons.rules import RandomEnd, Rules
     from cprl.envs import CommonsEnv
     from cprl.evaluation import crossplay, evaluate_run, gains
-    from cprl.experiment import Experiment, presets
+    from cprl.experiment import EarlierGame, Experiment, presets
     from cprl.measuring.statistics import differences, estimates
     from cprl.runs.schedule import Schedule
     from cprl.studies import Study, run_study
@@ -77,6 +77,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CommonsEnv",
     "Custom",
+    "EarlierGame",
     "Experiment",
     "Fresh",
     "Game",
@@ -124,6 +125,7 @@ __all__ = [
 _MODULES: Final = {
     "CommonsEnv": "cprl.envs",
     "Custom": "cprl.values",
+    "EarlierGame": "cprl.experiment",
     "Experiment": "cprl.experiment",
     "Fresh": "cprl.system.defaults",
     "Game": "cprl.commons.game",

@@ -26,7 +26,7 @@ from cprl.institutions import Boundaries, GraduatedSanctions, Quota
 from cprl.networks import MLP
 from cprl.objectives.rewards import Exchange
 from cprl.population import Learning, Scripted, Team
-from cprl.runs.recipe import resume_command, start_run
+from cprl.runs.recipe import resume_command, start_run, started_by
 from cprl.system import shipped
 from cprl.system.output import Output, console, quote_command
 from cprl.system.shipped import (
@@ -382,7 +382,8 @@ def test_a_recipe_runs_its_experiment(runs):
 
 
 def test_cprl_run_trains_the_experiment_of_a_recipe_or_resumes_its_run(runs, tmp_path, monkeypatch):
-    run = start_run(tmp_path / "run", "mine", experiment().to_recipe, command=["recipes/mine.py"])
+    with started_by(["recipes/mine.py"]):
+        run = start_run(tmp_path / "run", "mine", experiment().to_recipe)
     monkeypatch.setattr(sys, "argv", ["cprl", "run", str(run)])
     with pytest.raises(SystemExit, match=r"^cprl: my_game:Callback would be imported.* --allow my_game:Call"):
         cli.main()
@@ -447,9 +448,9 @@ def test_the_recipes_are_listed_with_a_line_each_and_printed_as_they_are(monkeyp
     call(monkeypatch, "recipe")
     lines = capsys.readouterr().out.splitlines()
     assert len(lines) == sum(recipe.is_runnable for recipe in shipped_recipes().values())
-    (line,) = [line for line in lines if line.startswith("study/time_out ")]
+    (line,) = [line for line in lines if line.startswith("study/exploration ")]
     assert line.endswith(
-        "How long should a tagged agent stay out? The time-out, from one turn to most of an episode."
+        "Is the tragedy an artefact of the end of exploration? The steps over which epsilon decays."
     )
     call(monkeypatch, "recipe commons")
     assert capsys.readouterr().out == (ROOT / "recipes" / "commons.py").read_text()
@@ -472,7 +473,7 @@ def test_a_printed_recipe_that_imports_others_finds_them_anywhere(name, elsewher
 
 @pytest.mark.integration
 def test_a_module_of_ones_own_comes_before_that_of_the_recipes(elsewhere):
-    (elsewhere / "mine.py").write_text(recipe_named("study/time_out").portable_source())
+    (elsewhere / "mine.py").write_text(recipe_named("study/exploration").portable_source())
     (elsewhere / "base.py").write_text("raise SystemExit('my own base')")
     done = subprocess.run([sys.executable, "mine.py", "--help"], capture_output=True, text=True)
     assert (done.returncode, done.stderr.strip()) == (1, "my own base")
@@ -491,11 +492,12 @@ def test_a_recipe_is_run_by_its_name_with_its_own_flags(elsewhere, monkeypatch, 
 
 
 def test_the_line_that_resumes_a_recipe_run_by_its_name_is_that_command(tmp_path):
-    words = [f"{shipped.PROGRAM}study/time_out", "--seed", "3", "--out", "there"]
-    typed = f"{shlex.join(cprl_command())} run study/time_out"
-    assert resume_command(tmp_path, words) == f"{typed} --seed 3 --out {tmp_path} --resume"
-    recipe = start_run(tmp_path / "run", "x", lambda directory: {"experiment": {}}, command=words)
-    assert '"command": "cprl run study/time_out --seed 3"' in (recipe / "recipe.json").read_text()
+    words = [f"{shipped.PROGRAM}study/exploration", "--seed", "3", "--out", "there"]
+    typed = f"{shlex.join(cprl_command())} run study/exploration"
+    with started_by(words):
+        assert resume_command(tmp_path) == f"{typed} --seed 3 --out {tmp_path} --resume"
+        recipe = start_run(tmp_path / "run", "x", lambda directory: {"experiment": {}})
+    assert '"command": "cprl run study/exploration --seed 3"' in (recipe / "recipe.json").read_text()
 
 
 @pytest.fixture
@@ -542,20 +544,21 @@ def test_a_line_to_type_calls_the_command_however_it_was_called(program, python)
     script.unlink()
     typed = f"{python} -m cprl run runs/a"
     assert resume_command(Path("runs/a")) == f"{typed} --resume"
-    assert resume_command(Path("runs/a"), ["cprl", "run", "runs/a"]) == f"{typed} --out runs/a --resume"
+    with started_by(["cprl", "run", "runs/a"]):
+        assert resume_command(Path("runs/a")) == f"{typed} --out runs/a --resume"
 
 
 def test_a_study_is_run_and_a_recipe_swept_by_its_name(elsewhere, monkeypatch, capsys):
-    call(monkeypatch, "run study/time_out --dry-run --replicas 1")
-    assert "0 of 5 trials finished" in capsys.readouterr().out
+    call(monkeypatch, "run study/exploration --dry-run --replicas 1")
+    assert "0 of 4 trials finished" in capsys.readouterr().out
     call(monkeypatch, "sweep two_complex --vary game.rules.freeze-steps=2,5 --dry-run")
     assert "2 conditions (game.rules.freeze_steps)" in capsys.readouterr().out
 
 
 def test_a_file_or_a_run_of_that_name_comes_first_but_not_the_folder_of_a_study(elsewhere):
     assert is_shipped("commons")
-    (elsewhere / "studies" / "time_out").mkdir(parents=True)
-    assert is_shipped("study/time_out"), "where the study itself writes"
+    (elsewhere / "studies" / "exploration").mkdir(parents=True)
+    assert is_shipped("study/exploration"), "where the study itself writes"
     (elsewhere / "commons").mkdir()
     (elsewhere / "commons" / "recipe.json").write_text("{}")
     assert not is_shipped("commons")

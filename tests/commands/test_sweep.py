@@ -337,7 +337,11 @@ def test_where_trials_are_run_is_said_by_jobs_and_on():
     ("command", "typed", "published"),
     [
         (["cprl", "sweep", "mine.py"], "/bin/py -m cprl sweep mine.py", "cprl sweep mine.py"),
-        (["cprl run study/time_out"], "/bin/py -m cprl run study/time_out", "cprl run study/time_out"),
+        (
+            ["cprl run study/exploration"],
+            "/bin/py -m cprl run study/exploration",
+            "cprl run study/exploration",
+        ),
         (["my study.py"], "/bin/py 'my study.py'", "py 'my study.py'"),
     ],
 )

@@ -23,7 +23,7 @@ from cprl.commons.cells import APPLE, GROUND
 from cprl.evaluation import film_pictures
 from cprl.evaluation.film import Style, film, film_video, titles_of
 from cprl.evaluation.film_pictures import EpisodePicture
-from cprl.evaluation.fresh import fresh_episode
+from cprl.evaluation.fresh import fresh_episodes
 from cprl.experimental.export_turns import export_turns
 from cprl.institutions import Monitoring, Quota
 from cprl.pictures.colours import PALETTE, agent_colour
@@ -137,7 +137,7 @@ def test_titles_are_what_tells_runs_apart(runs, tmp_path):
     ]
 
     def titles(*names):
-        return titles_of([fresh_episode(name) for name in names])
+        return titles_of([fresh_episodes([name])[0] for name in names])
 
     assert titles(runs / "greedy") == ["Greedy"]
     assert titles(runs / "greedy", runs / "random") == ["Greedy", "Random"]
@@ -182,7 +182,7 @@ def test_with_the_seed_of_an_evaluation_its_worlds_are_filmed(tmp_path):
 
     of_evaluation = played(worlds, stay)
     for seed, is_same in ((77, True), (78, False)):
-        one = fresh_episode(run, replica=1, episode=3 * 1 + 1, seed=seed)
+        (one,) = fresh_episodes([run], replica=1, episode=3 * 1 + 1, seed=seed)
         assert torch.equal(played(one.env, stay[:1])[0], of_evaluation[4]) is is_same
 
 

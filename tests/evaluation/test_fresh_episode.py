@@ -11,7 +11,7 @@ from matrix_games import prisoners_dilemma
 from stored_runs import CORRIDORS, DQN, MEADOW, an_experiment, command, stored
 
 from cprl.evaluation.film import Style, film, film_video
-from cprl.evaluation.fresh import averages_of, fresh_episode, fresh_episodes, fresh_seed, typical_replica
+from cprl.evaluation.fresh import averages_of, fresh_episodes, fresh_seed, typical_replica
 from cprl.evaluation.play import open_session, play_in_terminal
 from cprl.evaluation.show import show
 from cprl.runs.recipe import start_run
@@ -25,6 +25,12 @@ from cprl.values import trust
 TURNS, APPLES = [9.0, 2.0, 4.0, 14.0], [20.0, 3.0, 11.0, 30.0]
 """Of four replicas in their evaluation. Medians: 6.5 turns, to which 9 and 4 are equally near, and 15.5
 apples, to which 11 and 20 are equally near: so it is the replica that comes first, 0."""
+
+
+def fresh_episode(run, **numbers):
+    """A fresh episode of a single run."""
+    (fresh,) = fresh_episodes([run], **numbers)
+    return fresh
 
 
 def trained(folder, *, game=MEADOW, turns=TURNS, apples=APPLES, seed=3):

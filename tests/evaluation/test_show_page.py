@@ -14,7 +14,7 @@ from viewers import browser, wait_until
 
 from cprl import Custom, keys, presets
 from cprl.commons.cells import BEAM
-from cprl.evaluation.fresh import fresh_episode, record
+from cprl.evaluation.fresh import fresh_episodes, record
 from cprl.evaluation.show import show
 from cprl.institutions import Boundaries, Monitoring, Punishment, Quota, Tax
 from cprl.measuring.registry import SOCIAL_METRICS
@@ -66,7 +66,7 @@ def test_a_page_holds_the_episode_that_a_film_shows(runs, tmp_path):
     )
     data = told(path)
     greedy, governed = data["populations"]
-    filmed = record(fresh_episode(runs / "governed", episode=1))
+    filmed = record(*fresh_episodes([runs / "governed"], episode=1))
     cells = [moment.row * governed["width"] + moment.col for moment in filmed.boards]
     assert governed["cell"].tolist() == [row.tolist() for row in cells]
     assert governed["harvested"].tolist() == [moment.harvested.tolist() for moment in filmed.boards]

@@ -59,7 +59,7 @@ def test_links_lead_to_the_same_page_list_or_replay_from_every_depth(tmp_path):
     pages.stage_pages(tmp_path)
     page = (tmp_path / "institutions.md").read_text()
     assert "](repository/recipes/institutions.py.md)" in page
-    assert "](results/institutions/index.md)" in page
+    assert "](results/studies/changes/institutions.md)" in page
     assert "](replays.md?replay=commons)" in (tmp_path / "watching.md").read_text()
     readme = (tmp_path / "repository" / "about.md").read_text()
     assert "](../game.md)" in readme

@@ -23,7 +23,8 @@ def recipes():
     """The modules of the folder by name."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(RECIPES / "study" / "perolat")
-        return {name: import_module(name) for name in ("perolat_base", *STUDIES, "perolat_claims")}
+        names = ("perolat_base", *STUDIES, "perolat_claims", "perolat_lows")
+        return {name: import_module(name) for name in names}
 
 
 def in_miniature(study):
@@ -136,3 +137,23 @@ def test_a_file_of_claims_that_cannot_be_written_is_refused_before_anything_is_p
     monkeypatch.setattr(claims, "table", None)  # it would be called
     with pytest.raises(IsADirectoryError, match="a directory; allowed: the name of a file"):
         claims.main(out=tmp_path / "new")
+
+
+def test_the_lowest_harvests_are_those_of_the_committed_tables(recipes, monkeypatch, tmp_path):
+    lows = recipes["perolat_lows"]
+    monkeypatch.chdir(RECIPES.parent)
+    lows.main(out=tmp_path / "lows.md")
+    committed = (RECIPES.parent / "docs" / "results" / "studies" / "perolat_lows.md").read_text()
+    assert (tmp_path / "lows.md").read_text() == committed
+
+
+def test_the_lowest_harvest_is_looked_for_after_the_peak(recipes):
+    courses = {"collective_return": [1.0, 8.0, 4.0, 6.0], "survival_steps": [9.0, 7.0, 5.0, 3.0]}
+    rows = [
+        {"replica": 0, "episode": 10 * window, "metric": metric, "part": "training", "value": value}
+        for metric, course in courses.items()
+        for window, value in enumerate(course)
+    ]
+    random = {"replica": 0, "episode": 0, "metric": "collective_return", "part": "random", "value": 2.0}
+    cells = recipes["perolat_lows"].row(pa.Table.from_pylist([*rows, random]), windows=1)
+    assert [cell.split()[0] for cell in cells] == ["8", "4", "2", "5"], "not the 1 before the peak"

@@ -123,7 +123,7 @@ def run(bare):
 
 COMMANDS = {
     "run": ("run {run} --resume --episodes 3", "Training curve:"),
-    "recipe": ("recipe", "study/time_out"),
+    "recipe": ("recipe", "study/exploration"),
     "film": ("film {run} --out film.gif", "film.gif"),
     "export": ("export {run} exported", "exported"),
     "evaluate": ("evaluate {run} --episodes 1", "collective_return"),
@@ -199,7 +199,7 @@ def test_a_printed_recipe_of_an_experiment_runs_anywhere(name, bare, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", ["study/time_out", "study/learners/tuning_commons", "study/perolat/perolat_walls"]
+    "name", ["study/exploration", "study/learners/tuning_commons", "study/perolat/perolat_walls"]
 )
 def test_a_printed_recipe_of_a_study_finds_what_it_imports(name, bare, tmp_path):
     (tmp_path / "mine.py").write_text(bare.cprl(f"recipe {name}"))

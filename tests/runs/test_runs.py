@@ -38,7 +38,14 @@ from cprl.runs.curves import as_curves, curve_worlds
 from cprl.runs.episodes import read_episodes
 from cprl.runs.export import export_results
 from cprl.runs.length import Length
-from cprl.runs.recipe import read_recipe, refuse_another_run, resume_command, runs_in, start_run
+from cprl.runs.recipe import (
+    read_recipe,
+    refuse_another_run,
+    resume_command,
+    runs_in,
+    start_run,
+    started_by,
+)
 from cprl.runs.schedule import Schedule
 from cprl.studies.factors import with_changes
 from cprl.system.shipped import cprl_command
@@ -58,8 +65,8 @@ EXPERIMENT = Experiment(
 # The directory and its recipe
 
 
-def begin(run, experiment=EXPERIMENT, **options):
-    return start_run(run, experiment.name, experiment.to_recipe, **options)
+def begin(run, experiment=EXPERIMENT):
+    return start_run(run, experiment.name, experiment.to_recipe)
 
 
 def resume(run, experiment=EXPERIMENT):
@@ -83,7 +90,8 @@ def test_a_stopped_run_is_resumed_by_the_same_recipe(tmp_path):
 
 def test_the_recipe_of_a_run_is_its_experiment(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    run = begin(None, command=["recipes/commons.py", "--episodes", "3"])
+    with started_by(["recipes/commons.py", "--episodes", "3"]):
+        run = begin(None)
     recipe = read_recipe(run)
     assert recipe["command"] == "recipes/commons.py --episodes 3"
     assert recipe["experiment"]["agents"][3]["run"] == "../earlier"
@@ -202,7 +210,8 @@ def test_where_nothing_can_be_resumed_that_is_said(tmp_path):
 )
 def test_the_line_that_resumes_is_the_one_that_began_with_the_runs_directory(given, line, tmp_path):
     command = ["recipes/commons.py", *shlex.split(given)]
-    resumes = resume_command(tmp_path, command)
+    with started_by(command):
+        resumes = resume_command(tmp_path)
     assert resumes == f"{sys.executable} recipes/commons.py{line} --out {tmp_path} --resume"
 
 

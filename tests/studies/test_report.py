@@ -21,7 +21,7 @@ from cprl.terminal.summary import comparison_table
 from cprl.training.stored import load
 from cprl.values import trust
 
-STUDY = RESULTS / "studies" / "beam"
+STUDY = RESULTS / "studies" / "exploration"
 GOVERNED = replace(CORRIDORS, institutions=(Quota(share=0.5, window_steps=2),))
 
 
@@ -69,7 +69,7 @@ def test_a_report_of_a_training_says_what_happened_and_draws_it(tmp_path):
 
 
 def test_a_report_of_a_study_has_question_expectation_answer_figure_and_tables(tmp_path):
-    folder = shutil.copytree(STUDY, tmp_path / "beam")
+    folder = shutil.copytree(STUDY, tmp_path / "exploration")
     text = report(folder).read_text(encoding="utf-8")
     summary = (folder / "summary.md").read_text(encoding="utf-8")
     question = re.search(r"\*\*Question\.\*\* (.*)", summary)[1]
@@ -88,7 +88,7 @@ def test_a_report_of_a_study_has_question_expectation_answer_figure_and_tables(t
 
 
 def test_pictures_of_other_places_are_no_part_of_a_report(tmp_path):
-    folder = shutil.copytree(STUDY, tmp_path / "beam")
+    folder = shutil.copytree(STUDY, tmp_path / "exploration")
     (tmp_path / "secret.png").write_bytes(b"secret")
     summary = folder / "summary.md"
     summary.write_text(summary.read_text() + "\n![a](../secret.png)\n\n<script>alert(1)</script>\n")
@@ -118,7 +118,7 @@ def test_the_command_writes_a_page_once(tmp_path, monkeypatch, capsys):
 @pytest.mark.parametrize("width", [1440, 400])
 def test_chromium_shows_reports_without_scrolling_sideways(tmp_path, width):
     run = stored(tmp_path / "governed", GOVERNED)
-    pages = [report(run, episodes=2), report(shutil.copytree(STUDY, tmp_path / "beam"))]
+    pages = [report(run, episodes=2), report(shutil.copytree(STUDY, tmp_path / "exploration"))]
     with browser(pages[0].as_uri(), size=(width, 900)) as window:
         window.resize(width, 900)
         for number, page in enumerate(pages):

@@ -62,4 +62,4 @@ SIXTEEN_WORLDS = (
     *(318, 395, 322, 323, 437, 516, 438, 360, 266, 243, 217, 206),
     *(195, 193, 200, 191, 197, 190),
 )
-"""Mean apples of each 16 episodes of recipes/tragedy.py, whose random play gets 280; the last ones about."""
+"""Mean apples of each 16 episodes of a tragedy, whose random play gets 280; the last ones about."""

@@ -14,6 +14,7 @@ from cprl.values import KINDS
 REQUIRED = {
     "Game": lambda: replace(GAME, institutions=(institutions.Quota(fine=1.0), institutions.Monitoring())),
     "Map": lambda: GAME.map,
+    "EarlierGame": lambda: cprl.EarlierGame(game=GAME, steps=100),
     "Learning": lambda: LEARNING,
     "Team": lambda: population.Team(algorithms.VDN(settings=algorithms.DQNSettings()), agents=(0, 1)),
     "Frozen": lambda: population.Frozen("runs/none", agent=0),

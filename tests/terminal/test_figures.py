@@ -16,6 +16,7 @@ from matplotlib.image import imread
 from matplotlib.text import Text
 from PIL import Image
 from published import published_experiment
+from published_figures import on_white
 from results import Result
 from written_episodes import an_episode
 
@@ -23,7 +24,7 @@ import cprl
 from cprl import Game, Rules, maps, presets
 from cprl.algorithms import DQN, MADDPG, PPO, PR2, SAC
 from cprl.learners.settings import DQNSettings, RolloutSettings
-from cprl.measuring.windows import centres
+from cprl.measuring.windows import running_mean
 from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.runs.curves import episode_of_turn
 from cprl.runs.episodes import table_of
@@ -113,7 +114,7 @@ def test_a_centred_running_mean_stands_at_the_middle_of_its_episodes(tmp_path, d
     bold = next(line for line in curves_panels(drawn[0])[0].lines if line.get_color() == style.MEAN)
     assert "highest and last mean of 3 episodes, 58 apples, episode 58" in labels(drawn[0])
     np.testing.assert_allclose(bold.get_xdata(), bold.get_ydata(), err_msg="a mean of a line lies on it")
-    assert centres(np.zeros(5), 2).tolist() == [0.5, 1.5, 2.5, 3.5]
+    assert running_mean(np.arange(5.0), 2).tolist() == [0.5, 1.5, 2.5, 3.5]
 
 
 def test_a_running_mean_of_many_worlds_counts_each_world_alike(tmp_path, drawn):
@@ -161,8 +162,8 @@ def test_a_game_without_a_harvest_has_one_panel_and_an_agents_colour_has_an_edge
     pq.write_table(rows, table / "episodes.parquet")
     training_curve(table, title="matrix")
     assert [axes.get_ylabel() for axes in drawn[0].axes] == ["income of all agents together"]
-    assert len(style.on_white(2)["path_effects"]) == 2
-    assert style.on_white(0)["linestyle"] != style.on_white(4)["linestyle"], "its colour may be the same"
+    assert len(on_white(2)["path_effects"]) == 2
+    assert on_white(0)["linestyle"] != on_white(4)["linestyle"], "its colour may be the same"
 
 
 def a_line(path, title="a line", name="a line", **look):

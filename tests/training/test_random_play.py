@@ -13,6 +13,7 @@ from watched import EXPERIMENT
 
 import cprl
 from cprl.envs.env_state import load_transforms_state, transforms_state
+from cprl.institutions import Tax, Vote
 from cprl.measuring.playing import evaluate
 from cprl.measuring.statistics import estimate
 from cprl.measuring.windows import last_of
@@ -60,10 +61,12 @@ def test_random_play_moves_no_generator_even_of_a_game_that_draws_from_global_on
     assert states() == before
 
 
-def test_random_play_of_a_game_with_transforms_or_of_somebody_elses_is_played_again():
+def test_random_play_of_a_game_with_transforms_or_ballots_or_of_somebody_elses_is_played_again():
     assert is_repeatable(EXPERIMENT)
     counter = Custom("torchrl.envs:StepCounter", {})
     assert not is_repeatable(replace(EXPERIMENT, transforms=(counter,)))
+    voting = replace(EXPERIMENT.game, institutions=(Vote(on=Tax()),))
+    assert not is_repeatable(replace(EXPERIMENT, game=voting)), "agents see what random ones voted for"
     somebodys = replace(EXPERIMENT, game=Custom("matrix_game:MatrixGame"), agents=(Scripted("random"),) * 2)
     assert not is_repeatable(somebodys)
 

@@ -214,7 +214,7 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
         second.load_state_dict(state)
         observer = observing(second)
         observer.load_state_dict(observed)
-        observer.on_start(SimpleNamespace(steps=1000))
+        observer.on_start(SimpleNamespace(steps=1000, env=env))
         play([49], observer, worlds=[1])
         play(range(50, 70), observer)
         second.flush()

@@ -11,10 +11,13 @@ The rules, set before any of these studies ran:
 - Replicas are the unit. Differences are paired by replica, which share their seeds; intervals are by
   Student's t at 95 %; all expectations of one study are one family, and Holm's method judges them together.
 - An expectation says "more", "less" or "same" of a difference in the primary outcome. "Same" is held if both
-  one-sided tests against `MARGIN` say so (D. Schuirmann, 1987); that 0 is in an interval says nothing.
+  one-sided tests against `MARGIN` say so (D. Schuirmann, 1987); that 0 is in an interval says nothing. It
+  failed if the difference is beyond the margin: its p in the family is twice the smallest of the three
+  one-sided ones, within the margin, above and below it. What Holm's method leaves open cannot be told.
 - Every share is of the most that the condition's own board and agents allow, and of the best known there.
 """
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -24,10 +27,15 @@ import cprl
 from cprl import presets
 from cprl.algorithms import DQN, DQNSettings
 from cprl.commons.game import Game
+from cprl.measuring.registry import APPLES, unit
 from cprl.population import Frozen, Learning
 from cprl.studies import Study
 from cprl.studies.trials import trials_of
 
+sys.path.append(str(Path(__file__).parents[1]))  # for modules of recipes/study, where this one comes first
+
+RESULTS: Final = Path("docs", "results", "studies")
+"""The directory of the results of all studies, from the root of the repository."""
 WORLDS: Final = 16
 STEPS: Final = 400_000
 """Steps of each replica: 25,000 turns, with an update of each agent after each but the first."""
@@ -72,6 +80,10 @@ class Expectation:
     part: Literal["evaluation", "training"] = "evaluation"
     """Frozen in fresh worlds, or the last episodes of the training, in which agents learn."""
     margin: float = MARGIN
+
+    def __post_init__(self) -> None:
+        if self.sign == "same" and self.margin == MARGIN and unit(self.metric) != APPLES:
+            raise ValueError(f"margin is {MARGIN} apples; allowed for {self.metric}: another one")
 
 
 def trained(study: Study, condition: str) -> tuple[Frozen, ...]:

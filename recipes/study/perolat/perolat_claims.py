@@ -1,8 +1,9 @@
-"""Do the claims of Perolat et al. (2017) hold in the finished studies of this folder? A table in Markdown.
+"""Do claims after Perolat et al. (2017) hold in the finished studies of this folder? A table in Markdown.
 
     python recipes/study/perolat/perolat_claims.py --runs studies/runs --out docs/results/studies/perolat.md
 
-A claim is a direction: some measure is larger under one condition than under another. Its row has both, and
+A claim is a direction: some measure is larger under one condition than under another. They are claims as we
+wrote them before the runs; docs/results/details.md says what others report of the paper. A row has both, and
 their difference paired by replica, with 95 % intervals by Student's t over replicas. Social metrics are those
 of the evaluation of each run, trained agents in fresh worlds and random ones in the same; measures of
 territory are of 20 further episodes, played here.
@@ -36,6 +37,8 @@ EPISODES: Final = 20
 """The episodes of each replica, as many as in the evaluation of a run."""
 OVERLAP: Final = TERRITORY_NUMBERS["overlap"]
 DEFENCE: Final = TERRITORY_NUMBERS["defence"]
+OURS: Final = " (our reading)"
+"""The end of a claim that no account of the paper makes."""
 Measure = Callable[[Path, str], Float64]
 """From a run and "trained" or "random" to a number of each replica, [R]."""
 
@@ -125,7 +128,7 @@ def claims() -> Iterator[Claim]:
     """Yield the claims, each for both lengths of the beam; the first one also without a beam."""
     study = perolat_open.STUDY
     *beams, none = study.conditions
-    text = "agents who learn harvest less than random ones, and deplete the open commons"
+    text = f"in the end agents who learn harvest less than random ones, and deplete the open commons{OURS}"
     for condition in study.conditions:
         measures = ("harvest, apples", "survival, steps")
         yield Claim(text, measures, Agents(study, condition, "random"), Agents(study, condition))
@@ -144,8 +147,8 @@ def claims() -> Iterator[Claim]:
         yield Claim(text, ("equality", OVERLAP), no_walls, walls)
     for beam in BEAMS:
         equal, unequal = _rooms(perolat_unequal.STUDY, beam, "equal", "unequal")
-        yield Claim("with unequal rooms agents are less equal", ("equality",), equal, unequal)
-        text = "those who begin in the richer room get more, and all together do"
+        yield Claim(f"with unequal rooms agents are less equal{OURS}", ("equality",), equal, unequal)
+        text = f"those who begin in the richer room get more, and all together do{OURS}"
         share = "share of apples of those who begin in the north-west room"
         yield Claim(text, (share, "harvest, apples"), unequal, equal)
 

@@ -24,8 +24,18 @@ from cprl.values import Range, Seed, checked
 from cprl.values.array_types import UInt8
 
 _AGENT_ENTRIES: Final = (
-    *("observation", "harvest", "in_play", "fired", "hit_by", "tagged_by"),
-    *("cleaned", "apple_ahead", "fines", "transfers", "violated", "counts"),
+    "observation",
+    "harvest",
+    "in_play",
+    "fired",
+    "hit_by",
+    "tagged_by",
+    "cleaned",
+    "apple_ahead",
+    "fines",
+    "transfers",
+    "violated",
+    "counts",
 )
 _WORLD_ENTRIES: Final = ("stock", "regrown", "waste", "in_force", "ballots_due")
 _DONE_ENTRIES: Final = ("done", "terminated", "truncated")

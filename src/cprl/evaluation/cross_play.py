@@ -14,7 +14,7 @@ but not together with the background agents, so that only the first difference r
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import pyarrow as pa
 
@@ -77,30 +77,26 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
         raise ValueError(f"the replicas are {list(replicas)}; allowed for cross_seed: at least 2")
     next_replica = dict(zip(replicas, (*replicas[1:], replicas[0]), strict=True))
 
-    def populations(focal: str, background: str) -> Iterator[_Population]:
-        """Yield the populations of a cell, one for each focal agent; in self-play there is a single one."""
+    def populations(focal: str, background: str) -> Iterator[tuple[int, list[AgentOfReplica]]]:
+        """Yield the index of each focal agent of a cell, and all agents; in self-play `_SELF_PLAY` alone."""
         background_agents = agents_of(loaded[background])
-        count = len(background_agents)
         if focal == background and diagonal == "self":
-            yield _Population(_SELF_PLAY, background_agents, [BOTH] * count)
+            yield _SELF_PLAY, background_agents
             return
         stored_replicas = next_replica if focal == background else None
         focal_agents = agents_of(loaded[focal], stored_replicas)
         for index, focal_agent in enumerate(focal_agents):
-            agents = [*background_agents[:index], focal_agent, *background_agents[index + 1 :]]
-            yield _Population(index, agents, roles_of(count, [index]))
+            yield index, [*background_agents[:index], focal_agent, *background_agents[index + 1 :]]
 
     def cell_tables() -> Iterator[pa.Table]:
         for focal, background in product(loaded, repeat=2):
-            for population in populations(focal, background):
-                labels: Label = {FOCAL: focal, BACKGROUND: background, "focal_agent": population.focal_agent}
+            for index, agents in populations(focal, background):
+                labels: Label = {FOCAL: focal, BACKGROUND: background, "focal_agent": index}
+                roles = roles_of(len(agents), [index])
+                if index == _SELF_PLAY:
+                    roles = [BOTH] * len(agents)
                 yield play_fresh(
-                    fresh,
-                    loaded[background],
-                    population.agents,
-                    labels,
-                    roles=population.roles,
-                    among=loaded.values(),
+                    fresh, loaded[background], agents, labels, roles=roles, among=loaded.values()
                 )
 
     per_focal_agent = " with focal agent at each index"
@@ -110,16 +106,6 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
         fresh=fresh,
         diagonal=diagonal,
     )
-
-
-class _Population(NamedTuple):
-    """The agents that play together in a cell of the matrix."""
-
-    focal_agent: int
-    """The index of the focal agent; `_SELF_PLAY` if there is no single one."""
-    agents: list[AgentOfReplica]
-    roles: list[str]
-    """The role of each agent, see `cprl.measuring.table.ROLE`."""
 
 
 def named_runs(runs: Runs) -> dict[str, LoadedRun]:

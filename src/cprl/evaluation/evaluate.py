@@ -43,11 +43,12 @@ def refuse_other_games(runs: Mapping[str, LoadedRun]) -> None:
 def differing_entries(state: Mapping[str, Any], other_state: Mapping[str, Any]) -> list[str]:
     """Return the names of the entries of a transforms' state that another state lacks or has with another
     value."""
-    return [name for name, value in state.items() if not _has_entry(other_state, name, value)]
-
-
-def _has_entry(state: Mapping[str, Any], name: str, value: Any) -> bool:
-    return name in state and torch.equal(torch.as_tensor(value), torch.as_tensor(state[name]))
+    differing = []
+    for name, value in state.items():
+        other = other_state.get(name)
+        if other is None or not torch.equal(torch.as_tensor(value), torch.as_tensor(other)):
+            differing.append(name)
+    return differing
 
 
 def refuse_unlike(names: str, game: Any, other_game: Any, path: str = "") -> None:

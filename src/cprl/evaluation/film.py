@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
-from tensordict import TensorDictBase
 
 from cprl import keys
 from cprl.envs.unwrap import commons_of
@@ -26,7 +25,6 @@ from cprl.evaluation.film_pictures import (
 from cprl.evaluation.fresh import (
     FreshEpisode,
     Recorded,
-    fresh_episode,
     fresh_episodes,
     print_descriptions,
     record,
@@ -35,7 +33,7 @@ from cprl.evaluation.populations import commons_game
 from cprl.measuring.playing import turns
 from cprl.measuring.series import Observer
 from cprl.measuring.tracker import Episode, tracker_of
-from cprl.pictures.readable import growth_of, in_lower_case, legend_of
+from cprl.pictures.readable import capitalised, growth_of, in_lower_case, legend_of
 from cprl.runs.files import refuse_to_write_over
 from cprl.system.defaults import FILM_SUFFIXES
 from cprl.system.output import legible
@@ -75,13 +73,13 @@ def film(
     Raises:
         FileExistsError: if the recording exists.
     """
-    if out is not None and Path(out).suffix != ".rrd":
-        raise refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
     if out is not None:
+        if Path(out).suffix != ".rrd":
+            raise refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
         refuse_to_write_over(Path(out))
-    fresh = fresh_episode(run, replica=replica, episode=episode, seed=seed)
-    numbers = f"{fresh.replica}-{fresh.episode}"
-    target = Path(run) / f"film-{numbers}.rrd" if out is None else Path(out)
+    (fresh,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed)
+    default_path = Path(run) / f"film-{fresh.replica}-{fresh.episode}.rrd"
+    target = Path(out or default_path)
     refuse_to_write_over(target)
     print_descriptions([fresh])
     target.parent.mkdir(parents=True, exist_ok=True)
@@ -118,19 +116,12 @@ def _record_to_file(fresh: FreshEpisode, target: Path, title: str) -> Episode:
         tracker = tracker_of(env)
         for step, batch in enumerate(turns(env, fresh.policies), start=1):
             observer.on_step(batch)
-            for event in (*_tags_in(batch), *events(batch)):
+            for event in events(batch):
                 _log(viewer, step, event)
             for episode in tracker.add(batch):
                 observer.on_episode(episode, {})
                 _log(viewer, step, f"the end; {episode.outcome}")
     return episode
-
-
-def _tags_in(batch: TensorDictBase) -> list[str]:
-    """Return a sentence for each agent that was tagged out in a turn."""
-    tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
-    pairs = [] if tagged_by is None else tagged_by[0].nonzero().tolist()
-    return [f"agent {tagged} is tagged out by agent {shooter}" for tagged, shooter in pairs]
 
 
 def _log(viewer: ViewerCallback, step: int, event: str) -> None:
@@ -266,7 +257,7 @@ def titles_of(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
     titles = [rule or "no rule" for rule in rules] if any(rules) else names
     for candidates in (titles, names):
         if len(set(candidates)) == len(fresh):
-            return [title[0].upper() + title[1:] for title in candidates]
+            return list(map(capitalised, candidates))
     return [legible(population.run.path.resolve().name) for population in fresh]
 
 

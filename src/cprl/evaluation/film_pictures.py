@@ -61,7 +61,7 @@ class EpisodePicture:
         board: Map,
         *,
         steps: int,
-        width: int = DEFAULT_WIDTH,
+        width: int,
         most_harvested: int = 0,
         height: int = 0,
     ) -> None:

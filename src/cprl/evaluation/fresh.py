@@ -14,19 +14,16 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
-from cprl.commons.game import Game
 from cprl.commons.world import WorldView
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.evaluate import as_loaded
 from cprl.evaluation.populations import refuse_trained_in
-from cprl.experiment import Experiment
 from cprl.measuring.playing import evaluate, turns
 from cprl.measuring.registry import COLLECTIVE_RETURN
 from cprl.measuring.table import where
 from cprl.measuring.tracker import Episode, tracker_of
 from cprl.policies.joint_policy import JointPolicy
-from cprl.population import AgentSpec
 from cprl.runs.episodes import read_rows
 from cprl.system.defaults import FILM_SEED
 from cprl.system.output import say
@@ -109,32 +106,6 @@ def _list_in_words(numbers: Sequence[float]) -> str:
     return " and ".join(filter(None, [", ".join(texts[:-1]), texts[-1]]))
 
 
-def unstored(game: Game, agents: Sequence[AgentSpec]) -> LoadedRun:
-    """Return a run of scripted agents that exists only in memory, and is played like a stored run."""
-    experiment = Experiment(name="scripted", game=game, agents=tuple(agents), episodes=1, replicas=1)
-    nowhere = Path(experiment.name)
-    return LoadedRun(
-        path=nowhere,
-        experiment=experiment,
-        recipe={},
-        networks={},
-        weights_from=nowhere,
-        transforms_state={},
-    )
-
-
-def fresh_episode(
-    run: str | Path | LoadedRun,
-    *,
-    replica: int | None = None,
-    episode: int | None = None,
-    seed: int | None = None,
-) -> FreshEpisode:
-    """Return one fresh episode of one run, see `fresh_episodes`."""
-    (fresh,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed)
-    return fresh
-
-
 def fresh_episodes(
     runs: Sequence[str | Path | LoadedRun],
     *,
@@ -157,12 +128,9 @@ def fresh_episodes(
             default 20011, or the next seed that differs from all training seeds. The same numbers give the
             same episodes.
     """
-    if episode is not None:
-        episode = checked("episode", episode, Annotated[int, Range(0, 2**32 - 1)])
-    if replica is not None:
-        replica = checked("replica", replica, Natural)
-    if seed is not None:
-        seed = checked("seed", seed, Seed)
+    episode = checked("episode", episode, Annotated[int, Range(0, 2**32 - 1)] | None)
+    replica = checked("replica", replica, Natural | None)
+    seed = checked("seed", seed, Seed | None)
     loaded = [as_loaded(run) for run in runs]
     if seed is None:
         seed = fresh_seed(loaded)

@@ -2,10 +2,9 @@
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
 
 from cprl.measuring.registry import with_unit
-from cprl.measuring.statistics import Estimate, Family, notes_on
+from cprl.measuring.statistics import Family, notes_on
 from cprl.system.defaults import Fresh
 from cprl.terminal import style
 from cprl.terminal.panels import draw_matrix, matrix_height
@@ -53,7 +52,7 @@ def matrix_table(family: Family, metric: str, title: str, note: str = "") -> Tex
         note: the text below the matrix; by default the notes on its estimates.
     """
     row_labels, column_labels = _matrix_labels(family)
-    estimates = _estimates_by_pair(family, metric)
+    estimates = family.column(metric)
     cells = {pair: Change(estimate) if family.name else estimate for pair, estimate in estimates.items()}
     rows: list[list[TableCell]] = []
     for row_label in row_labels:
@@ -69,11 +68,6 @@ def _matrix_labels(family: Family) -> tuple[list[str], list[str]]:
     return rows, rows if set(rows) == set(columns) else columns
 
 
-def _estimates_by_pair(family: Family, metric: str) -> dict[Any, Estimate]:
-    """Return the estimates of one metric by their labels."""
-    return {key[:-1]: estimate for key, estimate in family.items() if key[-1] == metric}
-
-
 def draw_matrices(
     path: Path | str,
     family: Family,
@@ -81,8 +75,8 @@ def draw_matrices(
     *,
     title: str,
     caption: str,
-    other_cells: Mapping[tuple[str, str], str] | None = None,
-    width: style.Width = "page",
+    other_cells: Mapping[tuple[str, str], str],
+    width: style.Width,
 ) -> Path:
     """Draw metrics of a family with two labels, one matrix for each; a star marks significant differences.
 
@@ -96,10 +90,10 @@ def draw_matrices(
         for axes, (metric, panel_title) in zip(panels, titles.items(), strict=True):
             values = {}
             texts = {}
-            for pair, estimate in _estimates_by_pair(family, metric).items():
+            for pair, estimate in family.column(metric).items():
                 values[pair] = estimate.value
                 texts[pair] = f"{estimate.value:+.3g}" + " *" * estimate.differs
-            draw_matrix(sheet, axes, rows, columns, values, {**texts, **(other_cells or {})})
+            draw_matrix(sheet, axes, rows, columns, values, {**texts, **other_cells})
             axes.set(xlabel=family.by[1], ylabel=family.by[0])
             axes.set_title(panel_title)
         sheet.title = title

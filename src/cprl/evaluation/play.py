@@ -328,7 +328,7 @@ def board_text(session: Session) -> Text:
     return text
 
 
-def board_named(board: str, variant: Variant = "published") -> tuple[Game, LoadedRun | None]:
+def board_named(board: str, variant: Variant) -> tuple[Game, LoadedRun | None]:
     """Return the game that a name stands for, and its run if the name is a run's directory.
 
     Args:

@@ -207,12 +207,11 @@ def run_scenarios(
     background_runs = _load_background_runs(loaded, chosen)
     fresh = fresh_for([loaded], fresh, among=background_runs.values())
 
-    def background_of(scenario: Scenario) -> list[AgentOfReplica]:
-        return [
+    backgrounds = {}
+    for scenario in chosen:
+        backgrounds[scenario.name] = [
             _background_agent(spec, background_runs, loaded, fresh.replicas) for spec in scenario.background
         ]
-
-    backgrounds = {scenario.name: background_of(scenario) for scenario in chosen}
     populations = {RUN_AGENTS: agents_of(loaded)}
     for policy in FOCAL_AGENTS[1:]:
         populations[policy] = [scripted_agent(policy)] * count

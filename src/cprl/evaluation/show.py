@@ -30,7 +30,7 @@ from cprl.pictures.colours import GREY, PALETTE, agent_colour, agent_mark, line_
 from cprl.pictures.image import EMPTY_SITE_COLOUR
 from cprl.pictures.readable import NO_RULES, growth_of, legend_of, meaning_of, rules_of
 from cprl.population import learned
-from cprl.runs.files import refuse_to_write_over, write_atomically
+from cprl.runs.files import refuse_to_write_over, write_text
 from cprl.system.working import working
 from cprl.training.stored import LoadedRun
 from cprl.values import refusal
@@ -39,8 +39,12 @@ from cprl.viewer.pictures import regions_of
 _MOST_RUNS: Final = 6
 """The largest number of runs on a page."""
 _COLOURS: Final = {
-    **{name: PALETTE[kind] for name, kind in (("wall", WALL), ("apple", APPLE), ("beam", BEAM))},
-    **{name: PALETTE[kind] for name, kind in (("water", WATER), ("waste", WASTE), ("cleaning", CLEANING))},
+    "wall": PALETTE[WALL],
+    "apple": PALETTE[APPLE],
+    "beam": PALETTE[BEAM],
+    "water": PALETTE[WATER],
+    "waste": PALETTE[WASTE],
+    "cleaning": PALETTE[CLEANING],
     "empty": EMPTY_SITE_COLOUR,
 }
 _IN_PLAY: Final = 4
@@ -94,7 +98,7 @@ def show(
     print_descriptions(fresh)
     data, episodes = data_of(fresh, titles)
     path.write(page(_heading(fresh, data), begins(commons_game(fresh[0].run)), data))
-    return path, tuple(episodes)
+    return path, episodes
 
 
 def begins(game: Game) -> str:
@@ -130,7 +134,7 @@ class Page(type(Path())):  # type: ignore[misc]
     def write(self, text: str) -> None:
         """Write the page, complete or not at all."""
         self.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(self, lambda file: file.write(text.encode("utf-8", "replace")))
+        write_text(self, text)
 
     def _repr_html_(self) -> str:
         text = escape(self.read_text(encoding="utf-8"))
@@ -157,7 +161,7 @@ def page(
 
 def data_of(
     fresh: Sequence[FreshEpisode], titles: Sequence[str] = ()
-) -> tuple[dict[str, Any], Sequence[Episode]]:
+) -> tuple[dict[str, Any], tuple[Episode, ...]]:
     """Play the episodes; return the data that `show.html` draws, and the episodes."""
     games = [commons_game(population.run) for population in fresh]
     recorded = [record(population) for population in fresh]
@@ -168,7 +172,7 @@ def data_of(
         "axis": max(played.last for played in recorded),
         "most": max(int(played.boards[-1].harvested.max()) for played in recorded),
         "legend": legend_of(games),
-    }, [played.episode for played in recorded]
+    }, tuple(played.episode for played in recorded)
 
 
 def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, Any]:

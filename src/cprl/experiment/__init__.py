@@ -1,7 +1,7 @@
 """What is trained, as values.
 
 Modules:
-    experiment  Experiment: everything that decides a training
+    experiment  Experiment: everything that decides a training; EarlierGame, which it plays first
     engine      which engine trains it, if it says "auto"
     presets     the published games and hyper-parameters by name
 """
@@ -10,9 +10,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from cprl.experiment.experiment import Experiment, changes
+    from cprl.experiment.experiment import EarlierGame, Experiment, changes
 
-__all__ = ["Experiment", "changes"]
+__all__ = ["EarlierGame", "Experiment", "changes"]
 
 
 def __getattr__(name: str) -> Any:

@@ -35,6 +35,7 @@ from cprl.values import (
     DirectoryName,
     Positive,
     Range,
+    Steps,
     Value,
     build,
     checked,
@@ -52,6 +53,20 @@ MOST_SEED: Final = 2**64 - 2
 """Evaluation plays worlds of the next seed."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class EarlierGame(Value):
+    """A game that agents play before another one in the same training, see `Experiment.earlier`."""
+
+    game: Game | Custom | PlayableGame
+    """The game; it shows and asks the same of the same agents as the game at the end."""
+    steps: Steps
+    """Steps of each replica, W in each turn of W worlds; the turn that reaches them is the game's last."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "game", stored_game(self.game))
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Experiment(Value, stored=False, called="experiment"):
     """A training as a value: the game, its agents, and how they are trained.
@@ -63,13 +78,16 @@ class Experiment(Value, stored=False, called="experiment"):
     name: DirectoryName
     """The name of the recipe, and of the run's directory."""
     game: Game | Custom | PlayableGame
-    """The game that is played."""
+    """The game that is played: in training, after those of `earlier`, in evaluations and afterwards."""
     agents: tuple[AgentSpec, ...]
     """The specification of each agent; see `cprl.population`."""
     episodes: Positive | None = None
     """Episodes that each replica trains, in all its worlds together; None with `steps`."""
     steps: Annotated[int, Range(1, MOST_INT64)] | None = None
     """Steps that each replica trains, W in each turn of W worlds; None with `episodes`."""
+    earlier: tuple[EarlierGame, ...] = ()
+    """Games that agents play first in a training of `steps`, in this order. Where one ends, the running
+    episodes are cut, as by a time limit, and not counted; what learns carries on."""
     replicas: Annotated[int, Range(1, 2**20)] = 1
     """Independent repetitions R of the whole training, side by side."""
     worlds: Annotated[int, Range(1, 2**20)] = 1
@@ -132,18 +150,23 @@ class Experiment(Value, stored=False, called="experiment"):
     @property
     def title(self) -> str:
         """Return the title of its figures, summary and recording."""
-        return f"{self.name}, {self.trained_in}, {self.length}"
+        return f"{self.name}, {self.trained_in}, {self.length}{self._in_earlier_games}"
 
     @property
     def trained_for(self) -> str:
         """Return the length and the replicas in words."""
-        return f"trained for {self.length} in {self.trained_in}"
+        return f"trained for {self.length} in {self.trained_in}{self._in_earlier_games}"
 
     @property
     def trained_in(self) -> str:
         """Return the replicas, and their worlds if there are several, in words."""
         worlds = f" of {self.worlds:,} worlds" if self.worlds > 1 else ""
         return f"{self.replicas} replica{'s' * (self.replicas > 1)}{worlds}"
+
+    @property
+    def _in_earlier_games(self) -> str:
+        steps = sum(part.steps for part in self.earlier)
+        return f", the first {steps:,} steps in other games" if steps else ""
 
     @property
     def length(self) -> Length:
@@ -165,6 +188,7 @@ class Experiment(Value, stored=False, called="experiment"):
         self.to_config()
         check_custom_metrics(self.metrics)
         _check_numbers(self)
+        _check_earlier(self)
         _check_agents(self, self.schedule)
         _check_engine(self)
 
@@ -236,6 +260,22 @@ def _check_numbers(experiment: Experiment) -> None:
             raise ValueError(
                 f"experiment has {target}, of the script that runs, which nothing else can import; allowed: "
                 "the class or function itself, or a module of its own, and its name"
+            )
+
+
+def _check_earlier(experiment: Experiment) -> None:
+    worlds = experiment.worlds
+    most = (experiment.steps or 0) - worlds
+    for index, part in enumerate(experiment.earlier):
+        name = f"experiment.earlier[{index}].steps"
+        if experiment.steps is None:
+            raise ValueError(f"{name} is {part.steps}; allowed in a training of steps, not of episodes")
+        before = sum(other.steps for other in experiment.earlier[:index])
+        if not worlds <= part.steps <= most - before:
+            raise ValueError(
+                f"{name} is {part.steps}; allowed in {experiment.steps} steps of {worlds} worlds"
+                f"{f', after {before} steps' * (before > 0)}: {worlds} to {most - before}, so that each game "
+                "has a turn"
             )
 
 

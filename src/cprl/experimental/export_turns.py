@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from cprl import keys
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import as_loaded
-from cprl.evaluation.fresh import Recorded, fresh_episode, record
+from cprl.evaluation.fresh import Recorded, fresh_episodes, record
 from cprl.evaluation.populations import refuse_trained_in
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.defaults import FILM_SEED as SEED
@@ -90,7 +90,7 @@ def export_turns(
     def played() -> Iterator[Exported]:
         for episode in range(episodes):
             note_progress(episode, episodes, "episodes")
-            fresh = fresh_episode(loaded, replica=replica, episode=episode, seed=seed)
+            (fresh,) = fresh_episodes([loaded], replica=replica, episode=episode, seed=seed)
             yield _exported(loaded.game, record(fresh))
 
     target.parent.mkdir(parents=True, exist_ok=True)

@@ -8,7 +8,7 @@ What is played and trained is the recipe that the page hands out.
 import json
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -25,9 +25,10 @@ from urllib.parse import parse_qsl, urlsplit
 
 from cprl.commons.game import Game
 from cprl.commons.published import game as published_game
-from cprl.evaluation.fresh import fresh_episodes, unstored
+from cprl.evaluation.fresh import fresh_episodes
 from cprl.evaluation.show import data_of, page
-from cprl.population import Scripted
+from cprl.experiment import Experiment
+from cprl.population import AgentSpec, Scripted
 from cprl.system.defaults import SANDBOX_EPISODES as EPISODES
 from cprl.training.stored import LoadedRun, load
 from cprl.values import Positive, Range, Value, checked, hints_of
@@ -194,7 +195,7 @@ class Sandbox:
             greedy = min(sliders.greedy, sliders.agents)
             others = game.agents - greedy
             agents = (Scripted("greedy"),) * greedy + (Scripted("sustainable"),) * others
-            runs: dict[str, LoadedRun] = {f"{greedy} greedy, {others} restrained": unstored(game, agents)}
+            runs: dict[str, LoadedRun] = {f"{greedy} greedy, {others} restrained": _unstored(game, agents)}
             if trained and self._trained is not None:
                 runs[f"Trained with {self._learned_under[self._trained]}"] = load(self._trained)
             data, _ = data_of(fresh_episodes(list(runs.values()), replica=0, episode=0), list(runs))
@@ -230,6 +231,20 @@ class Sandbox:
         if code == 0:
             self._trained = run
         return {"state": "failed" if code else "trained", "line": line}
+
+
+def _unstored(game: Game, agents: Sequence[AgentSpec]) -> LoadedRun:
+    """Return a run of scripted agents that exists only in memory, and is played like a stored run."""
+    experiment = Experiment(name="scripted", game=game, agents=tuple(agents), episodes=1, replicas=1)
+    nowhere = Path(experiment.name)
+    return LoadedRun(
+        path=nowhere,
+        experiment=experiment,
+        recipe={},
+        networks={},
+        weights_from=nowhere,
+        transforms_state={},
+    )
 
 
 class _Handler(BaseHTTPRequestHandler):

@@ -25,8 +25,8 @@ def choose_update(
     make_loss: MakeLoss,
     example: Callable[[int], TensorDict],
     *,
-    declared: Update | None = None,
-    sharing: int = 1,
+    declared: Update | None,
+    sharing: int,
 ) -> Update:
     """Return how the lanes of a loss are updated.
 
@@ -47,29 +47,24 @@ def choose_update(
         ValueError: if the loss is refused, see `check_loss`; or if it keeps state that lanes would share, and
             is declared to be updated for all lanes at once.
     """
-    loss_state = ", ".join(check_loss(make_loss(deepcopy(networks[0])), example(1)[0]))
+    state_names = check_loss(make_loss(deepcopy(networks[0])), example(1)[0])
+    obstacle = f"agents would share what the loss keeps of a call: {', '.join(state_names)}"
     if declared is not None:
-        if loss_state and declared != "list":
-            raise ValueError(
-                f'update is "{declared}", and agents would share what the loss keeps of a call: '
-                f'{loss_state}; allowed: update = "list", or none'
-            )
+        if state_names and declared != "list":
+            raise ValueError(f'update is "{declared}", and {obstacle}; allowed: update = "list", or none')
         return declared
-    reason = f"agents would share what the loss keeps of a call: {loss_state}"
-    if not loss_state:
-        trial_networks = networks[:_TRIAL_LANES]
-        batch = example(len(trial_networks) * sharing)
+    if not state_names:
+        trial = networks[:_TRIAL_LANES]
+        batch = example(len(trial) * sharing)
         try:
-            lane_networks = LaneNetworks(
-                trial_networks, make_loss, _TRIAL_RULE, update="vmapped", sharing=sharing
-            )
+            lane_networks = LaneNetworks(trial, make_loss, _TRIAL_RULE, update="vmapped", sharing=sharing)
             for _ in range(2):  # the first step may leave something that breaks the second
                 lane_networks.learn(Draw.of(batch.clone()))
             return "vmapped"
         except Exception as error:  # a user's loss may raise anything
-            reason = (str(error) or repr(error)).splitlines()[0]
+            obstacle = (str(error) or repr(error)).splitlines()[0]
     warnings.warn(
-        f"agents are updated one after the other, which is many times slower: {reason}",
+        f"agents are updated one after the other, which is many times slower: {obstacle}",
         RuntimeWarning,
         stacklevel=5,
     )

@@ -102,14 +102,14 @@ class LaneNetworks:
             for name, parameter in network.named_parameters():
                 if name in self._network_weights:
                     parameter.requires_grad_(False).data = self._network_weights[name]
+        losses = [loss]
         if update == "vmapped":
             entropy_by_formula(loss)
-        modules = [loss]
-        if update == "list":
-            modules = [make_loss(deepcopy(lane_network)) for lane_network in networks]
-        for module in modules:
-            mark_targets_updated(module)
-        self.losses = [FunctionalLoss(module) for module in modules]
+        elif update == "list":
+            losses = [make_loss(deepcopy(lane_network)) for lane_network in networks]
+        for lane_loss in losses:
+            mark_targets_updated(lane_loss)
+        self.losses = [FunctionalLoss(lane_loss) for lane_loss in losses]
         self._names = tuple(self.params)
         self._target_names = tuple(self.targets)
         self._tensors = [list(group.values()) for group in self._groups().values()]
@@ -183,10 +183,9 @@ class LaneNetworks:
             results = [
                 self._single_gradient(index, params, targets, batch) for index in range(len(self.losses))
             ]
-            gradients, losses = zip(*results, strict=True)
-            return [torch.stack(by_network) for by_network in zip(*gradients, strict=True)], torch.stack(
-                losses
-            )
+            gradients_by_network, losses_by_network = zip(*results, strict=True)
+            by_weight = zip(*gradients_by_network, strict=True)
+            return [torch.stack(gradients) for gradients in by_weight], torch.stack(losses_by_network)
         gradient_function = torch.func.grad(self._total_loss, has_aux=True)
         if self.update == "vmapped":
             gradient_function = torch.vmap(gradient_function)

@@ -61,12 +61,13 @@ def gather(
     """
     last = index
     reward = fields["reward"][index, column].unsqueeze(-1)
+    row = fields["row"][index, column]
+    last_row = row
     optional = {} if noise is None else {"noise": noise}
     if horizon is not None:
         last, reward, steps = _returns(fields, index, column, horizon)
+        last_row = fields["row"][last, column]
         optional["steps_to_next_obs"] = steps.unsqueeze(-1)
-    row = fields["row"][index, column]
-    last_row = row if horizon is None else fields["row"][last, column]
     observation = fields["observation"]
     next_entries = TensorDict(
         {

@@ -53,8 +53,6 @@ SHARE_UNIT: Final = "0 to 1"
 _RATIO: Final = "ratio"
 APPLES: Final = "apples"
 _STEPS: Final = "steps"
-
-
 _INT: Final = pa.int32()
 
 
@@ -76,10 +74,8 @@ class Total:
     [B]; None if it follows from other totals, or from the last turn."""
     is_of_institutions: bool = False
     """True if only games with institutions report it."""
-    words: str = ""
-    """Its name in plots of single agents."""
-    unit: str = ""
-    """Its unit in plots of single agents."""
+    is_logged: bool = False
+    """True if it is logged for each agent."""
 
     @property
     def skips_zeros(self) -> bool:
@@ -129,36 +125,35 @@ def _by_name(*entries: Any) -> dict[str, Any]:
     return {entry.name: entry for entry in entries}
 
 
-def _institution_total(name: str, entry: str, words: str, **more: Any) -> Total:
-    return Total(name=name, entry=entry, words=words, add=_add_entry, is_of_institutions=True, **more)
+def _logged_total(name: str, entry: str, **more: Any) -> Total:
+    """Return a total of institutions that is logged for each agent."""
+    return Total(name=name, entry=entry, add=_add_entry, is_of_institutions=True, is_logged=True, **more)
 
 
-_APPLES_COLUMN: Final = {"dtype": np.float64, "column": pa.float64(), "unit": APPLES}
 _FLOAT_COLUMN: Final[Any] = {"dtype": np.float64, "column": pa.float64()}
-_NO_COLUMN: Final[Any] = {"column": None}
 
 TOTALS: Final[Mapping[str, Total]] = _by_name(
     Total(name="return", **_FLOAT_COLUMN),
     Total(name="wanted_return", **_FLOAT_COLUMN),
     Total(name="harvest", entry="harvest", add=_add_entry, **_FLOAT_COLUMN),
-    Total(name="harvest_steps", entry="harvest", add=_count_harvests, **_NO_COLUMN),
-    Total(name="harvest_time", entry="harvest", add=_add_harvest_times, **_NO_COLUMN),
+    Total(name="harvest_steps", entry="harvest", add=_count_harvests, column=None),
+    Total(name="harvest_time", entry="harvest", add=_add_harvest_times, column=None),
     Total(name="steps", axes=""),
     Total(name="in_play_steps", entry="in_play", add=_add_entry),
     Total(name="shots", entry="fired", add=_add_entry),
-    Total(name="hit_by", entry="hit_by", axes="NN", add=_add_entry, **_NO_COLUMN),
+    Total(name="hit_by", entry="hit_by", axes="NN", add=_add_entry, column=None),
     Total(name="hits", entry="hit_by"),
     Total(name="tagged", entry="tagged_by", add=_count_any),
-    Total(name="tagged_by", entry="tagged_by", axes="NN", add=_add_entry, **_NO_COLUMN),
-    Total(name="tags", entry="tagged_by", **_NO_COLUMN),
+    Total(name="tagged_by", entry="tagged_by", axes="NN", add=_add_entry, column=None),
+    Total(name="tags", entry="tagged_by", column=None),
     Total(name="stock_left", entry="stock", axes=""),
     Total(name="depletion_step", entry="stock", axes="", add=_note_first_zero_step),
     Total(name="terminated", axes="", column=pa.bool_()),
     Total(name="decision", is_of_institutions=True),
-    _institution_total(FINES_TOTAL, FINES_TOTAL, "fined", **_APPLES_COLUMN),
-    _institution_total(TRANSFERS_TOTAL, TRANSFERS_TOTAL, "given", **_APPLES_COLUMN),
-    _institution_total(VIOLATIONS, "violated", VIOLATIONS, unit="turns"),
-    Total(name="counts", entry="counts", axes="NC", add=_keep_last, is_of_institutions=True, **_NO_COLUMN),
+    _logged_total(FINES_TOTAL, FINES_TOTAL, **_FLOAT_COLUMN),
+    _logged_total(TRANSFERS_TOTAL, TRANSFERS_TOTAL, **_FLOAT_COLUMN),
+    _logged_total(VIOLATIONS, "violated"),
+    Total(name="counts", entry="counts", axes="NC", add=_keep_last, is_of_institutions=True, column=None),
     *(
         Total(name=name, entry="counts", is_of_institutions=True)
         for name in COUNT_NAMES
@@ -171,7 +166,7 @@ TOTALS: Final[Mapping[str, Total]] = _by_name(
         dtype=np.float64,
         add=_keep_first,
         is_of_institutions=True,
-        **_NO_COLUMN,
+        column=None,
     ),
 )
 """All totals, in the order of the columns of tables. "hits" and "tags" are the sums of the columns of
@@ -191,8 +186,8 @@ ENTRY_KEYS: Final[Mapping[str, Any]] = {
     "stock": ("next", keys.STOCK),
     "in_force": ("next", keys.IN_FORCE),
 }
-"""The keys of optional and institutional entries in a batch."""
-AGENT_TOTALS: Final = tuple(name for name, total in TOTALS.items() if total.words)
+"""The keys of optional and institutional entries in a batch, the optional ones first."""
+AGENT_TOTALS: Final = tuple(name for name, total in TOTALS.items() if total.is_logged)
 """The totals of institutions that are logged for each agent."""
 
 
@@ -537,27 +532,29 @@ def is_custom_metric(name: str) -> bool:
     return not (name in METRICS or "/" in name or name.startswith("return_"))
 
 
-def _metric(name: str) -> Metric | None:
-    """Return a metric by name, with the words of a custom one as far as they are known; None for another
-    number."""
-    if name in METRICS or not is_custom_metric(name):
-        return METRICS.get(name)
-    words = METRIC_WORDS.get(name, {})
+def _metric(name: str) -> Metric:
+    """Return a metric by name, with the words of a custom one as far as they are known; for another number
+    its name in place of words."""
+    if name in METRICS:
+        return METRICS[name]
+    words: Mapping[str, str] = {}
+    hue = GREY
+    if is_custom_metric(name):
+        words = METRIC_WORDS.get(name, {})
+        hue = ORANGE
     return Metric(
-        name=name, words=words.get("title", name), unit=words.get("unit", ""), formula=float, colour=ORANGE
+        name=name, words=words.get("title", name), unit=words.get("unit", ""), formula=float, colour=hue
     )
 
 
 def title(name: str) -> str:
     """Return words and unit of a metric, e.g. "survival, steps"; for another number its name."""
-    metric = _metric(name)
-    return name if metric is None else metric.title
+    return _metric(name).title
 
 
 def colour(name: str) -> Colour:
     """Return the colour of a metric's lines."""
-    metric = _metric(name)
-    return GREY if metric is None else metric.colour
+    return _metric(name).colour
 
 
 def unit(name: str) -> str:
@@ -565,8 +562,8 @@ def unit(name: str) -> str:
     apples."""
     if name.startswith("return_") or name.endswith("/return"):
         return APPLES
-    metric = _metric(name)
-    return "" if metric is None or metric.unit == SHARE_UNIT else metric.unit
+    unit = _metric(name).unit
+    return "" if unit == SHARE_UNIT else unit
 
 
 def with_unit(name: str, *, rewards: str = "") -> str:
@@ -579,7 +576,7 @@ def with_unit(name: str, *, rewards: str = "") -> str:
     """
     if name == INCOME:
         return ", ".join(filter(None, (METRICS[name].words, rewards)))
-    if _metric(name) is not None:
+    if name in METRICS or is_custom_metric(name):
         return title(name)
     if name.startswith(IN_FORCE_PREFIX):
         return f"in force: decision {name.removeprefix(IN_FORCE_PREFIX)}"
@@ -596,9 +593,9 @@ def bounds(name: str, clock: float = inf) -> tuple[float, float]:
         clock: the steps of the longest episode that the game allows.
     """
     metric = _metric(name)
-    if metric is not None and metric.unit == SHARE_UNIT:
+    if metric.unit == SHARE_UNIT:
         return 0.0, 1.0
-    if metric is None or name == INCOME or name not in METRICS:
+    if name == INCOME or name not in METRICS:
         is_amount = name.rpartition("/")[2] in AGENT_TOTALS
         return 0.0 if is_amount else -inf, inf
     return 0.0, clock if metric.is_time else inf
@@ -622,12 +619,12 @@ def left_out_note(reported: Collection[str], *, more: Mapping[str, tuple[str, ..
     return f"left out: {text}" if text else ""
 
 
-def _entries_of(totals: Iterable[Total]) -> dict[str, tuple[str, ...]]:
-    return {total.name: (total.entry,) for total in totals if total.entry and total.column is not None}
-
-
 ENTRIES_OF_FIELDS: Final[Mapping[str, tuple[str, ...]]] = {
-    **_entries_of(total for total in TOTALS.values() if not total.is_of_institutions),
+    **{
+        name: (total.entry,)
+        for name, total in TOTALS.items()
+        if total.entry and total.column is not None and not total.is_of_institutions
+    },
     "tagged_by": ("tagged_by",),
 }
 """The entries that each field of an `Episode` needs; missing fields need none."""

@@ -62,6 +62,10 @@ class Observer:
         for on_step in self._on_step:
             on_step(batch)
 
+    def on_game(self, env: EnvBase, changes: str) -> None:
+        for on_game in self._hooks("on_game"):
+            on_game(env, changes)
+
     def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
         for on_ended in self._hooks("on_ended"):
             on_ended(ended)
@@ -121,7 +125,7 @@ class Series:
     defined.
     """
 
-    def __init__(self, replicas: int, worlds: int = 1) -> None:
+    def __init__(self, replicas: int, worlds: int) -> None:
         self.replicas = replicas
         self.worlds = worlds
         self._waiting_numbers: dict[int, dict[int, list[dict[str, float]]]] = {}

@@ -19,8 +19,8 @@ from cprl.values.array_types import Float64
 AgentGroups = Sequence[Sequence[int]]
 """The indices of the agents of each group of nested enterprises; each agent belongs to one group."""
 
-_ROUNDING = 1e-6
-"""The share of harvest and payments below which an income is 0, since payments are float32."""
+ROUNDING = 1e-6
+"""The share of a number that payments round off, since they are float32."""
 
 
 def share_of(part: Any, whole: Any) -> Float64:
@@ -50,7 +50,7 @@ def incomes_of(harvest: Any, fines: Any, transfers: Any) -> Float64:
     """
     harvest, fines, transfers = (np.asarray(part, np.float64) for part in (harvest, fines, transfers))
     incomes = harvest - fines + transfers
-    is_rounding = np.abs(incomes) <= _ROUNDING * (harvest + fines + transfers)
+    is_rounding = np.abs(incomes) <= ROUNDING * (harvest + fines + transfers)
     return np.where(is_rounding, 0.0, incomes)
 
 
@@ -67,6 +67,11 @@ def equality_between(incomes: Any, groups: AgentGroups) -> Float64:
     """Return the `equality` of the groups' mean incomes, each group counted once, [...]; principle 8."""
     incomes = np.asarray(incomes, np.float64)
     return equality(np.stack([incomes[..., list(group)].mean(-1) for group in groups], -1))
+
+
+def are_equal(values: Any, others: Any) -> bool:
+    """Return whether numbers are equal up to the `ROUNDING` of payments; undefined ones equal each other."""
+    return np.allclose(values, others, rtol=ROUNDING, atol=ROUNDING, equal_nan=True)
 
 
 def mean_of_defined(values: Float64) -> Float64:

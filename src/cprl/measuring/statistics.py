@@ -19,6 +19,7 @@ import pyarrow.compute as pc
 from numpy.typing import ArrayLike
 
 from cprl.measuring.registry import METRICS, bounds
+from cprl.measuring.social import ROUNDING
 from cprl.measuring.table import WINDOWS, all_metrics, by_replica
 from cprl.values.array_types import Bool, Float64
 
@@ -253,7 +254,7 @@ class Family(Mapping[Key, Estimate]):
     Args:
         estimates: by their keys, in the order of pages.
         by: the names of the labels.
-        name: the name of a family of differences, e.g. "differences from random".
+        name: the name of a family of differences, e.g. "these 12 differences"; "" for other estimates.
         tests: how many differences were tested together; one that two numbers share counts once.
     """
 
@@ -296,6 +297,10 @@ class Family(Mapping[Key, Estimate]):
     def of(self, *labels: Any) -> dict[str, Estimate]:
         """Return the estimates with these labels by number."""
         return {key[-1]: estimate for key, estimate in self.items() if key[:-1] == labels}
+
+    def column(self, number: str) -> dict[Labels, Estimate]:
+        """Return the estimates of a number by their labels."""
+        return {key[:-1]: estimate for key, estimate in self.items() if key[-1] == number}
 
     def note(self, of: str) -> str:
         """Return the meaning of bold; `of` says where these differences stand, e.g. "of this table"."""
@@ -340,7 +345,7 @@ def estimates(table: pa.Table, numbers: Sequence[str] | str = (), by: Sequence[s
     keys = _as_tuple(by)
     names = _as_tuple(numbers) or tuple(all_metrics(table))
     clock = _clock_of(table)
-    samples = {name: _samples(table, name, keys) for name in names}
+    samples = {name: samples_of(table, name, keys) for name in names}
     labels = dict.fromkeys(chain.from_iterable(samples.values()))
     means = {}
     for row in labels:
@@ -361,7 +366,6 @@ def differences(
     reference: Reference,
     *,
     paired: bool = True,
-    family: str = "",
 ) -> Family:
     """Return how much more each number is than that of its reference, with its interval by Student's t.
 
@@ -373,13 +377,12 @@ def differences(
         by: the labels that are kept apart.
         paired: whether replica r of both had the same random numbers: then the interval is that of the mean
             of the replicas' differences, else Welch's.
-        family: the name of the differences of this call, which Holm's method judges together.
     """
     keys = _as_tuple(by)
     clock = _clock_of(table)
     changes: dict[Key, Estimate] = {}
     for name in _as_tuple(numbers):
-        samples = _samples(table, name, keys)
+        samples = samples_of(table, name, keys)
         for labels, sample in samples.items():
             row = dict(zip(keys, labels, strict=True))
             reference_labels = reference(row) if callable(reference) else reference
@@ -397,7 +400,7 @@ def differences(
                 continue
             if change.replicas:
                 changes[(*labels, name)] = change.between(name, clock)
-    return judge_family(changes, keys, family)
+    return judge_family(changes, keys)
 
 
 CellWeights = Mapping[Any, float]
@@ -410,8 +413,6 @@ def contrasts(
     numbers: Sequence[str] | str,
     by: Sequence[str] | str,
     weights: Mapping[str, CellWeights],
-    *,
-    family: str = "",
 ) -> Family:
     """Return weighted sums of numbers within each replica, by contrast and number, over the replicas with a
     value in each row of a weight.
@@ -421,12 +422,11 @@ def contrasts(
         numbers: the names of the numbers.
         by: the labels that are kept apart.
         weights: the weights by the name of each contrast, see `mean_difference`.
-        family: the name of the contrasts of this call, which Holm's method judges together.
     """
     keys = _as_tuple(by)
     sums: dict[Key, Estimate] = {}
     for number in _as_tuple(numbers):
-        samples = _samples(table, number, keys)
+        samples = samples_of(table, number, keys)
         for name, cells in weights.items():
             weighted_values = []
             for label, weight in cells.items():
@@ -436,7 +436,7 @@ def contrasts(
             contrast = _weighted_sum(weighted_values)
             if contrast.replicas:
                 sums[name, number] = contrast
-    return judge_family(sums, ["contrast"], family)
+    return judge_family(sums, ["contrast"])
 
 
 def _weighted_sum(weighted_values: Sequence[tuple[float, Mapping[int, float]]]) -> Estimate:
@@ -470,7 +470,7 @@ def mean_difference(signs: CellWeights) -> CellWeights:
 
 
 @dataclass
-class _Sample:
+class Sample:
     """The values of a number in several replicas."""
 
     values: dict[int, float] = field(default_factory=dict)
@@ -484,9 +484,9 @@ class _Sample:
         return replace(estimate_if_finite(means), episodes=self.episodes, undefined=self.undefined)
 
 
-def _samples(table: pa.Table, number: str, by: Sequence[str]) -> dict[Labels, _Sample]:
+def samples_of(table: pa.Table, number: str, by: Sequence[str]) -> dict[Labels, Sample]:
     """Return the values of a number in each replica, by labels."""
-    samples: dict[Labels, _Sample] = defaultdict(_Sample)
+    samples: dict[Labels, Sample] = defaultdict(Sample)
     for row in by_replica(table, number, by).to_pylist():
         sample = samples[tuple(row[name] for name in by)]
         sample.episodes += row["episodes"]
@@ -509,7 +509,7 @@ def _clock_of(table: pa.Table) -> float:
     return float(pc.max(steps).as_py()) if len(steps) else inf
 
 
-def judge_family(differences: Mapping[Key, Estimate], by: Sequence[str] = (), name: str = "") -> Family:
+def judge_family(differences: Mapping[Key, Estimate], by: Sequence[str] = ()) -> Family:
     """Return differences as a family, judged together by Holm's method.
 
     A difference that equals that of the metric in `Metric.same_as` is the same test, and counts once.
@@ -527,14 +527,10 @@ def judge_family(differences: Mapping[Key, Estimate], by: Sequence[str] = (), na
     differ = holm([differences[key].p_value for key in tests])
     marked = set(chain.from_iterable(compress(tests.values(), differ)))
     family = {key: replace(change, differs=key in marked) for key, change in differences.items()}
-    return Family(family, by, name or f"these {len(tests)} differences", len(tests))
-
-
-_ROUNDING_SHARE: Final = 1e-6
-"""The share of a value that payments of float32 round off."""
+    return Family(family, by, f"these {len(tests)} differences", len(tests))
 
 
 def _is_same(first: Estimate, second: Estimate) -> bool:
     """Return whether two estimates are equal up to the rounding of payments."""
     pairs = zip((first.value, first.low, first.high), (second.value, second.low, second.high), strict=True)
-    return all(isclose(a, b, rel_tol=_ROUNDING_SHARE, abs_tol=_ROUNDING_SHARE) for a, b in pairs)
+    return all(isclose(a, b, rel_tol=ROUNDING, abs_tol=ROUNDING) for a, b in pairs)

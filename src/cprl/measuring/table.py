@@ -15,7 +15,7 @@ Functions that take a `metric` accept the name of a metric of whole episodes ("e
 
 from collections.abc import Mapping, Sequence
 from itertools import chain
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import pyarrow as pa
@@ -32,6 +32,7 @@ from cprl.measuring.registry import (
     compute_metrics,
     is_custom_metric,
 )
+from cprl.measuring.social import are_equal
 from cprl.values.array_types import Int64
 
 ROLE: Final = "role"
@@ -43,31 +44,28 @@ WINDOWS: Final = "window_episodes"
 """The column with the number of episodes of a window; only tables of windows have it."""
 _EPISODE_KEYS: Final = ("replica", "world", "episode")
 """The columns that tell an episode from others with the same labels."""
+ROW_ORDER: Final = [(name, "ascending") for name in ("replica", "episode", "agent")]
+"""The order of the rows of one run, for `pyarrow.Table.sort_by`."""
 _AGENT: Final = "agent_"
 """The beginning of an agent's name in the name of a metric."""
 _AGENT_NAMES: Final = b"agents"
 """The key of a table's metadata with the names that the game gives its agents."""
 
 
-def complete(table: pa.Table, constants: Mapping[str, Any] | None = None) -> pa.Table:
+def complete(table: pa.Table) -> pa.Table:
     """Return the table with all metrics of the registry that its totals determine.
-
-    Args:
-        constants: totals that are the same in every episode of the game, see
-            `cprl.measuring.registry.compute_metrics`.
 
     Raises:
         ValueError: if a metric has to be computed and the rows are not whole episodes, each with all agents
             in order.
     """
     columns = {*table.column_names}
-    available = columns | {*(constants or {})}
     missing = [name for name in METRICS if name not in columns]
-    computable = [name for name in missing if available >= {*METRICS[name].needs}]
+    computable = [name for name in missing if columns >= {*METRICS[name].needs}]
     if not computable or not len(table) or WINDOWS in columns:
         return table
     agents = _count_agents(table)
-    totals = dict(constants or {})
+    totals = {}
     needed = chain.from_iterable(METRICS[name].needs for name in computable)
     for name in columns & {*TOTALS} & {*needed}:
         values = table[name].to_numpy(zero_copy_only=False).astype(np.float64).reshape(-1, agents)
@@ -152,7 +150,7 @@ def all_metrics(table: pa.Table) -> list[str]:
     columns = full.column_names
     if {INCOME, COLLECTIVE_RETURN} <= {*columns} and FINES_TOTAL not in columns:
         income = full[INCOME].to_numpy()
-        if np.allclose(income, full[COLLECTIVE_RETURN].to_numpy(), rtol=1e-6, atol=1e-6, equal_nan=True):
+        if are_equal(income, full[COLLECTIVE_RETURN].to_numpy()):
             columns = [name for name in columns if name != INCOME]
     known = [name for name in METRICS if name in columns]
     custom = [name for name in stored_metrics(table.schema) if is_custom_metric(name)]

@@ -21,12 +21,9 @@ from cprl.envs.unwrap import agent_count, commons_of
 from cprl.institutions import COUNT_NAMES, Institution
 from cprl.keys import Turn
 from cprl.measuring.registry import (
-    ENTRIES_OF_FIELDS,
     ENTRY_KEYS,
     IN_FORCE_PREFIX,
-    INSTITUTION_ENTRIES,
     METRICS,
-    OPTIONAL_ENTRIES,
     TOTALS,
     compute_metrics,
     counts_for,
@@ -120,16 +117,9 @@ class Episode:
     @property
     def reported(self) -> tuple[str, ...]:
         """Return the optional entries that the game reported, see `cprl.measuring.registry`."""
-        lacking = {
-            entry
-            for name, needs in ENTRIES_OF_FIELDS.items()
-            if getattr(self, name) is None
-            for entry in needs
-        }
-        reported = [entry for entry in OPTIONAL_ENTRIES if entry not in lacking]
-        fields_there = [name for name, value in vars(self).items() if value is not None and name in TOTALS]
-        institutional = {TOTALS[name].entry for name in fields_there}
-        return (*reported, *(entry for entry in INSTITUTION_ENTRIES if entry in institutional))
+        totals = [name for name, value in vars(self).items() if value is not None and name in TOTALS]
+        entries = {TOTALS[name].entry for name in totals}
+        return tuple(entry for entry in ENTRY_KEYS if entry in entries)
 
 
 def _read_only(array: AnyArray) -> AnyArray:
@@ -143,11 +133,23 @@ _TAKEN_NAMES: Final = {
     *(entry.name for entry in fields(Episode)),
     *METRICS,
     *TOTALS,
-    *("role", "composition", "restrained_agents", "window_episodes"),
-    "replica",
+    "role",
+    "composition",
+    "restrained_agents",
+    "window_episodes",
     "agent",
-    *("policy", "trained_episodes", "focal", "focal_agent", "focal_agents", "background", "scenario"),
-    *("restrained", "runs", "worlds", "response", "chosen"),
+    "policy",
+    "trained_episodes",
+    "focal",
+    "focal_agent",
+    "focal_agents",
+    "background",
+    "scenario",
+    "restrained",
+    "runs",
+    "worlds",
+    "response",
+    "chosen",
 }
 """Names that custom metrics may not have: those of columns of tables, labels and other metrics."""
 
@@ -202,20 +204,40 @@ def try_custom_metrics(metrics: Sequence[Custom], env: EnvBase) -> dict[str, dic
         The "title" and "unit" of those whose functions have such attributes, by their names.
     """
     for entry in (0, 1) if metrics else ():
-        batch = env.fake_tensordict().apply(partial(torch.full_like, fill_value=entry))
-        batch["done"].zero_()
-        batch["next", "done"].fill_(True)
-        tracker_of(env, metrics).add(batch)
+        example_episode(env, metrics, entry=entry)
     words = {custom_metric_name(metric): metric_words(metric) for metric in metrics}
     return {name: word for name, word in words.items() if word}
+
+
+def example_episode(env: EnvBase, metrics: Sequence[Custom] = (), *, entry: int = 0) -> Episode:
+    """Return an episode of one turn in which all entries of an environment are the same number."""
+    batch = env.fake_tensordict().apply(partial(torch.full_like, fill_value=entry))
+    batch["done"].zero_()
+    batch["next", "done"].fill_(True)
+    return tracker_of(env, metrics).add(batch)[0]
+
+
+def with_missing(episode: Episode, others: Sequence[Episode]) -> Episode:
+    """Return an episode with what only episodes of other games have: metrics, which are undefined in it, and
+    what institutions take, give and count, which is 0."""
+    metrics = dict(episode.metrics)
+    counts = dict(episode.counts or {})
+    totals: dict[str, Any] = {}
+    for other in others:
+        metrics |= {name: nan for name in other.metrics if name not in metrics}
+        counts |= {
+            name: np.zeros_like(count) for name, count in (other.counts or {}).items() if name not in counts
+        }
+        for name in ("fines", "transfers", "violations"):
+            if getattr(episode, name) is None and getattr(other, name) is not None:
+                totals[name] = np.zeros_like(getattr(other, name))
+    return replace(episode, metrics=metrics, counts=counts or None, **totals)
 
 
 _RUNNING_TOTALS: Final = {name: total for name, total in TOTALS.items() if total.add is not None}
 """The totals that a tracker adds up for each running episode, beside its steps and returns."""
 _TOTALS_OF_EPISODES: Final = {entry.name for entry in fields(Episode)} & ({*TOTALS} - {"counts"})
 """The totals that are fields of an episode, unchanged."""
-_SCALAR_TOTALS: Final = {name for name, total in TOTALS.items() if not total.axes}
-"""The totals that are one number of the whole episode."""
 
 _REQUIRED_KEYS: Final[Mapping[str, Any]] = {
     "reward": ("next", *keys.REWARD),
@@ -328,7 +350,7 @@ class EpisodeTracker:
         running: dict[str, AnyArray] = {}
         if "steps" in state:  # else the tracker had seen no batch yet
             entries = {total.entry for name, total in _RUNNING_TOTALS.items() if name in state}
-            reported = tuple(entry for entry in (*OPTIONAL_ENTRIES, *INSTITUTION_ENTRIES) if entry in entries)
+            reported = tuple(entry for entry in ENTRY_KEYS if entry in entries)
             if self.reported not in (None, reported):
                 raise ValueError(
                     f"the state is from a game that reports {list(reported)}; allowed: "
@@ -457,9 +479,9 @@ class EpisodeTracker:
         episodes = []
         for index, world in enumerate(worlds):
             copied = {name: totals[name][index] for name in _TOTALS_OF_EPISODES if name in totals}
-            copied |= {
-                name: copied[name].item() for name in _TOTALS_OF_EPISODES & _SCALAR_TOTALS if name in copied
-            }
+            for name in copied:
+                if not TOTALS[name].axes:
+                    copied[name] = copied[name].item()
             episode = Episode(
                 world=int(world),
                 episode=int(self._episode_numbers[world]),

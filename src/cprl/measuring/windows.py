@@ -94,12 +94,5 @@ def running_mean(values: Float64, window: int = SMOOTHED_EPISODES) -> Float64:
     return means
 
 
-def centres(values: Float64, window: int) -> Float64:
-    """Return the episode at the centre of each running mean over `window` of these values, [..., E] to
-    [...]."""
-    window = min(window, values.shape[-1])
-    return np.arange(values.shape[-1] - window + 1) + (window - 1) / 2
-
-
 def _after_a_zero(values: Float64) -> Float64:
     return np.concatenate([np.zeros((*values.shape[:-1], 1)), values], -1)

@@ -31,6 +31,7 @@ from cprl.institutions import (
 from cprl.institutions.institution import Kind
 from cprl.institutions.monitoring import ELECTED
 from cprl.pictures.svg import board_svg
+from cprl.values import is_number
 
 
 def game_html(game: Game, custom_rules: str = "") -> str:
@@ -99,12 +100,17 @@ def rule_of(institution: Institution, *, is_voted_on: bool = False) -> str:
 def _numbers(value: object) -> list[float]:
     """Return the numbers that a field holds: those of a tuple, or the value itself if it is one."""
     values = value if isinstance(value, tuple) else (value,)
-    return [item for item in values if isinstance(item, int | float) and not isinstance(item, bool)]
+    return list(filter(is_number, values))
 
 
 def in_lower_case(name: str) -> str:
     """Return the name of a class in words: "closed season" for "ClosedSeason"."""
     return re.sub("(?<=[a-z])(?=[A-Z])", " ", name).lower()
+
+
+def capitalised(text: str) -> str:
+    """Return a text with its first letter in upper case."""
+    return text[:1].upper() + text[1:]
 
 
 def tag_of(game: Game) -> str:

@@ -31,7 +31,7 @@ The social outcomes of Perolat et al. (2017), `cprl.measuring.social`, distingui
 the harvest and how long it lasts ("greedy", "sustainable"), and peace ("territorial", "aggressive").
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal, get_args
 
 import numpy as np
@@ -68,6 +68,21 @@ SCRIPTED_POLICIES: Final[tuple[ScriptedPolicy, ...]] = get_args(ScriptedPolicy)
 """The names of all scripted policies, in the order of the constants RANDOM, GREEDY, ... of
 `cprl.policies.scripted_rules`."""
 
+_NEAR: Final = ("regrow_radius_cells", "regrow_norm")
+_BEAM: Final = (
+    "beam_length_cells",
+    "beam_width_cells",
+    "beam_tapers",
+    "beam_from_beside",
+    "beam_stops_at_agents",
+)
+RULES_READ: Final[Mapping[str, tuple[str, ...]]] = {
+    **dict.fromkeys(SCRIPTED_POLICIES, ("quirks",)),
+    "sustainable": ("quirks", *_NEAR),
+    "territorial": ("quirks", *_NEAR, *_BEAM),
+    "aggressive": ("quirks", *_BEAM),
+}
+"""The fields of `Rules` that each policy goes by, beside those of actions and windows."""
 SPARE: Final = 3
 """The number of apples that "sustainable" leaves near each apple it harvests. With the published
 probabilities, a site with 3 apples near it regrows five times as fast as one with 2. A cross of five sites,

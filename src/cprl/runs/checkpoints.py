@@ -176,9 +176,9 @@ class Checkpointer:
         self._signals.__enter__()
         return self
 
-    def __exit__(self, kind: object, error: object, traceback: object) -> None:
+    def __exit__(self, *error: object) -> None:
         self._signals.__exit__(None, None, None)
-        self._lock.__exit__(kind, error, traceback)
+        self._lock.__exit__(*error)
 
     def _on_signal(self, number: int) -> None:
         if self._asked_to_stop is not None:

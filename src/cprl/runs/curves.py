@@ -2,13 +2,13 @@
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Final
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from cprl.measuring.table import complete, stored_metrics, where, world_of
+from cprl.measuring.table import ROW_ORDER, complete, stored_metrics, where, world_of
 from cprl.measuring.windows import last_of
 from cprl.runs.episodes import read_episodes
 from cprl.values.array_types import Float64, Int64
@@ -31,7 +31,7 @@ def as_curves(table: pa.Table, *, last: int | None = None) -> dict[str, Float64]
     """Return the curves of a table of `read_episodes`, see `curves_of`."""
     if not table.num_rows:
         return {}
-    table = complete((table if last is None else last_of(table, last)).sort_by(_ORDER))
+    table = complete((table if last is None else last_of(table, last)).sort_by(ROW_ORDER))
     first = where(table, agent=0)
     rows = _episode_rows(first)
     curves = {
@@ -46,11 +46,8 @@ def as_curves(table: pa.Table, *, last: int | None = None) -> dict[str, Float64]
 def curve_worlds(table: pa.Table) -> Int64:
     """Return the world of each episode of a table's curves, int64 [R, E]; the replica if the table has no
     worlds."""
-    first = where(table.sort_by(_ORDER), agent=0)
+    first = where(table.sort_by(ROW_ORDER), agent=0)
     return world_of(first)[_episode_rows(first)]
-
-
-_ORDER: Final = [("replica", "ascending"), ("episode", "ascending"), ("agent", "ascending")]
 
 
 def _episode_rows(first: pa.Table) -> Int64:

@@ -18,7 +18,6 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
-from tensordict import TensorDictBase
 
 from cprl.measuring import Episode
 from cprl.measuring.registry import IN_FORCE_PREFIX, METRICS, SOCIAL_METRICS, TOTALS, left_out_note
@@ -159,9 +158,6 @@ class EpisodeTable:
             raise
         self._schema = batch.schema
         self._rows += batch.num_rows
-
-    def on_step(self, batch: TensorDictBase) -> None:
-        """Do nothing: a table stores whole episodes."""
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         self.add(episode)

@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import pyarrow as pa
 
+from cprl.measuring.table import ROW_ORDER
 from cprl.runs.checkpoints import CHECKPOINTS
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table, write_small
 from cprl.runs.files import (
@@ -24,7 +25,7 @@ from cprl.runs.files import (
 )
 from cprl.runs.length import without_length
 from cprl.runs.recipe import RECIPE_FILE, read_recipe, with_runs_moved
-from cprl.runs.weights import DECISIONS, FROZEN_FIELD as FROZEN, TRANSFORMS
+from cprl.runs.weights import DECISIONS, FROZEN_FIELD, TRANSFORMS
 from cprl.values import describe_changes
 
 _REQUIRED_FILES: Final = (RECIPE_FILE, REPORT)
@@ -96,14 +97,13 @@ def _with_frozen_moved(recipe: Mapping[str, Any], run: Path, folder: Path) -> di
     """Return a recipe in which the paths of `Frozen` agents' runs are relative to `folder` instead of
     `run`."""
     table: dict[str, Any] = with_runs_moved(recipe, run, folder)
-    if FROZEN in table:
-        checksums = table[FROZEN].items()
-        table[FROZEN] = {os.path.relpath(run / path, folder): digest for path, digest in checksums}
+    if FROZEN_FIELD in table:
+        checksums = table[FROZEN_FIELD].items()
+        table[FROZEN_FIELD] = {os.path.relpath(run / path, folder): digest for path, digest in checksums}
     return table
 
 
 def _write_small_table(table: pa.Table, folder: Path, name: str) -> None:
-    ordered = table.sort_by([(key, "ascending") for key in ("replica", "episode", "agent")])
     kinds = {field.name: pa.float32() if field.type == pa.float64() else field.type for field in table.schema}
-    small = ordered.cast(pa.schema(kinds, table.schema.metadata))
+    small = table.sort_by(ROW_ORDER).cast(pa.schema(kinds, table.schema.metadata))
     write_listed(folder, name, partial(write_small, small))

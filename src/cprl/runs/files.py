@@ -110,10 +110,14 @@ def remove_partial(*folders: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+def write_text(path: Path, text: str) -> Path:
+    """Write a text atomically, with "?" for what UTF-8 cannot encode."""
+    return write_atomically(path, lambda file: file.write(text.encode("utf-8", "replace")))
+
+
 def write_json(path: Path, value: object) -> None:
     """Write a JSON value atomically."""
-    text = json.dumps(value, indent=2, allow_nan=False) + "\n"
-    write_atomically(path, lambda file: file.write(text.encode()))
+    write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -429,7 +433,7 @@ class RunLock:
         except FileNotFoundError:
             return False
 
-    def __exit__(self, kind: object, error: object, traceback: object) -> None:
+    def __exit__(self, *error: object) -> None:
         if self._file is None:
             return
         with suppress(OSError):  # BlockingIOError if others still run the study

@@ -94,8 +94,6 @@ class LoggerCallback:
         resumes: whether an earlier process may have written episodes of the same training.
     """
 
-    is_extendable = True
-
     def __init__(self, logger: Logger, *, resumes: bool = False) -> None:
         for method in ("log_metrics", "flush", "shutdown"):
             if not callable(getattr(logger, method, None)):
@@ -135,6 +133,6 @@ class LoggerCallback:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: object, error: object, traceback: object) -> None:
+    def __exit__(self, *error: object) -> None:
         self.logger.flush()
         self.logger.shutdown()

@@ -68,16 +68,14 @@ def start_run(
     out: Path | None,
     name: str,
     to_recipe: Callable[[Path], Mapping[str, Any]],
-    *,
-    command: Sequence[str] | None = None,
 ) -> Path:
     """Make the directory of a run and write its recipe: the experiment, versions, the git commit of the code
-    of cprl, the type of processor, the time, and the command without local directories.
+    of cprl, the type of processor, the time, and the command line of `started_by`, or else of this process,
+    without local directories.
 
     Args:
         out: the directory, new or empty; None for `runs/<name>-<YYYYmmdd-HHMMSS>` in the working directory.
         to_recipe: returns the recipe for a directory, e.g. `cprl.Experiment.to_recipe`.
-        command: the command line, script first; by default that of `started_by`, or of this process.
 
     Raises:
         FileExistsError: if `out` is not empty.
@@ -100,7 +98,7 @@ def start_run(
                 **_circumstances(recipe),
                 **_code_by_checksum(recipe),
                 "started": started.isoformat(timespec="seconds"),
-                "command": _published_command(command or _CURRENT_COMMAND.get() or sys.argv),
+                "command": _published_command(_CURRENT_COMMAND.get() or sys.argv),
             }
             write_json(directory / RECIPE_FILE, recipe)
     except BaseException:
@@ -127,9 +125,7 @@ def _refuse_contents(directory: Path) -> None:
         raise FileExistsError(f"{directory} is not empty; allowed: a new or empty directory")
 
 
-def refuse_another_run(
-    out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]], kind: Any = None
-) -> Length:
+def refuse_another_run(out: Path | None, to_recipe: Callable[[Path], Mapping[str, Any]], kind: Any) -> Length:
     """Refuse to resume a run with another recipe than it began with; only its length may grow, and `on_nan`
     change.
 
@@ -355,15 +351,12 @@ def versions() -> dict[str, str | None]:
     return numbers
 
 
-def resume_command(run: Path, command: Sequence[str] | None = None) -> str:
-    """Return the command line that resumes a run.
+def resume_command(run: Path) -> str:
+    """Return the command line that resumes a run, which is that of `started_by` with other flags.
 
-    Args:
-        command: the command line that started or resumed it, script first; by default that of `started_by`. A
-            run that Python started without one is resumed by `cprl run`; a run with live code only by this
-            process.
+    A run that Python started without one is resumed by `cprl run`; a run with live code only by this process.
     """
-    command = command or _CURRENT_COMMAND.get()
+    command = _CURRENT_COMMAND.get()
     directory = f"./{run}" if str(run).startswith("-") else str(run)  # so that it is not read as a flag
     path = run / RECIPE_FILE
     table = read_json(path).get("experiment") if path.exists() else None

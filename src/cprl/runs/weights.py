@@ -63,7 +63,7 @@ class StoredWeights(NamedTuple):
     """The values of each lane's decisions."""
 
 
-def weights_in(run: Path, name: str | None = None) -> StoredWeights:
+def weights_in(run: Path, name: str | None) -> StoredWeights:
     """Load the weights of a run's agents, and the states that belong to them.
 
     Args:

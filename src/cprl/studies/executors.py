@@ -24,6 +24,8 @@ from cprl.system.output import console
 from cprl.system.process import on_signals
 from cprl.values import Range, Value
 
+Outcomes = Generator[TrialOutcome, None, None]
+"""The outcome of each trial, as soon as it has ended."""
 Jobs = Annotated[int, Range(1, 4096)]
 """The number of trials that run at the same time."""
 LOOK_S: Final = 0.1
@@ -38,7 +40,7 @@ class Executor(Protocol):
     raised.
     """
 
-    def run(self, tasks: Sequence[Task]) -> Generator[TrialOutcome, None, None]:
+    def run(self, tasks: Sequence[Task]) -> Outcomes:
         """Run every trial; they begin in order."""
 
 
@@ -47,7 +49,7 @@ class InProcess:
     """Runs one trial after the other in this process. It imports and compiles only once, which suits tiny
     trainings."""
 
-    def run(self, tasks: Sequence[Task]) -> Generator[TrialOutcome, None, None]:
+    def run(self, tasks: Sequence[Task]) -> Outcomes:
         for task in tasks:
             yield task.run_here()
 
@@ -90,7 +92,7 @@ class SideBySide(ABC):
         """Return the context in which processes are started."""
         return nullcontext()
 
-    def run(self, tasks: Sequence[Task]) -> Generator[TrialOutcome, None, None]:
+    def run(self, tasks: Sequence[Task]) -> Outcomes:
         """Run trials side by side; yield each outcome as soon as it is known."""
         waiting: list[Task] = []
         for task in tasks:

@@ -268,7 +268,7 @@ a few levels may be equal."""
 
 
 def draw_combinations(
-    factors: Mapping[str, Factor], draws: int, *, seed: int, design: Design = "random"
+    factors: Mapping[str, Factor], draws: int, *, seed: int, design: Design
 ) -> Iterator[dict[str, Level]]:
     """Draw random combinations of levels, more than are asked for.
 

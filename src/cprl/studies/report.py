@@ -12,9 +12,9 @@ from markdown_it import MarkdownIt
 
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import evaluate_run
-from cprl.evaluation.fresh import fresh_episode
+from cprl.evaluation.fresh import fresh_episodes
 from cprl.evaluation.show import Page, data_of, page
-from cprl.pictures.readable import growth_of, meaning_of, rule_of, tag_of
+from cprl.pictures.readable import capitalised, growth_of, meaning_of, rule_of, tag_of
 from cprl.population import learned
 from cprl.runs.curves import curves_of
 from cprl.studies.results import SUMMARY, answer_of
@@ -22,7 +22,7 @@ from cprl.studies.tables.tidy_table import StudyTable
 from cprl.system.defaults import SEED, STUDY_TABLE, Fresh
 from cprl.system.output import legible
 from cprl.system.working import working
-from cprl.terminal.course import course_of
+from cprl.terminal.course import NEEDED, course_of
 from cprl.terminal.figures import training_curve
 from cprl.terminal.summary import comparison_table
 from cprl.terminal.text_tables import markdown
@@ -75,10 +75,10 @@ def _run_page(run: LoadedRun, episodes: int, seed: int) -> str:
     name = legible(run.experiment.name.replace("_", " "))
     played = evaluate_run(run, Fresh(episodes=episodes, seed=seed))
     is_commons = isinstance(game, Game)
-    data = data_of([fresh_episode(run)])[0] if is_commons else None
+    data = data_of(fresh_episodes([run]))[0] if is_commons else None
     before = [growth_of(game)] if is_commons else []
     curves = _curves(run)
-    has_course = {"collective_return", "survival_steps"} <= set(curves)
+    has_course = set(NEEDED) <= set(curves)
     if has_course and (run.path / "evaluation" / "random.parquet").is_file():
         *facts, meaning = course_of(run.path, run.specs).splitlines()
         before.append("  \n".join([*facts, f"**{meaning}**"]))
@@ -120,7 +120,7 @@ def _rules(game: Game) -> str:
         *(f"- **{rule_of(one)}**: {meaning_of(one, game)}" for one in game.institutions),
     ]
     tag = tag_of(game)
-    lines += ["", f"{tag[:1].upper()}{tag[1:]}."] * bool(tag)
+    lines += ["", f"{capitalised(tag)}."] * bool(tag)
     return _html("\n".join(lines)) + _changed(game)
 
 

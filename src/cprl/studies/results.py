@@ -12,7 +12,7 @@ from typing import Final
 
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, title, unit
 from cprl.measuring.statistics import Estimate, number_format
-from cprl.runs.files import refuse_links, write_atomically
+from cprl.runs.files import refuse_links, write_text
 from cprl.studies.study import STATUS, Study
 from cprl.studies.study_figures import DRAWN, figures_of
 from cprl.studies.tables.comparing import (
@@ -26,13 +26,11 @@ from cprl.studies.tables.effects import effect_tables, effect_weights, effects_o
 from cprl.studies.tables.sources import study_table
 from cprl.studies.tables.tidy_table import (
     EVALUATION_PART,
-    LAST_EPISODES,
     RANDOM_PART,
     TRAINING_PART,
-    WINDOW_EPISODES,
     StudyTable,
 )
-from cprl.system.defaults import STUDY_TABLE
+from cprl.system.defaults import LAST_EPISODES, STUDY_TABLE, WINDOW_EPISODES
 from cprl.terminal.text_tables import TextTable, escape_cell, markdown
 
 SUMMARY: Final = "summary.md"
@@ -131,9 +129,7 @@ def write_summary(table: StudyTable, out: Path, *, again: str = "") -> Path:
         for name, what, _ in figures:
             lines += [f"![{what}]({FIGURES}/{name})", ""]
         lines += [*_provenance(table), *_lengths(table)]
-    content = ("\n".join(lines).rstrip() + "\n").encode("utf-8", "replace")
-    write_atomically(out / SUMMARY, lambda file: file.write(content))
-    return out / SUMMARY
+    return write_text(out / SUMMARY, "\n".join(lines).rstrip() + "\n")
 
 
 def _compared(table: StudyTable, part: str) -> list[str]:
@@ -212,7 +208,7 @@ def answer_of(table: StudyTable) -> str:
             family = effects_of(table, metric, part=EVALUATION_PART)
             beside = "effects of each factor over all cells of the grid, paired by replica"
             tests = f"{family.tests} effects on a metric"
-        changes = {name: one for (name, number), one in family.items() if number == metric}
+        changes = {name: one for (name,), one in family.column(metric).items()}
         parts += [f"- {subject}:", *_lines(changes, unit(metric))]
     what = f"In {episodes_text(table, EVALUATION_PART)}, {beside}"
     what += f"; by Holm's method for the {tests}:" if family.tests else ":"

@@ -3,7 +3,7 @@
 import json
 import time
 from collections import Counter
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,11 +12,10 @@ from typing import Annotated, Final
 from cprl.runs.checkpoints import endings_of
 from cprl.runs.files import RunLock, digest_of, holder_of, remove_partial, write_json
 from cprl.runs.states import state_of
-from cprl.studies.executors import Executor, InProcess
+from cprl.studies.executors import Executor, InProcess, Outcomes
 from cprl.studies.status import PATIENCE_S, Status, is_silent
 from cprl.studies.study import RUNS, STATUS, STUDY_FILE, Study, directory_of, levels_in
-from cprl.studies.tables.comparing import LAST_EPISODES
-from cprl.studies.tables.tidy_table import WINDOW_EPISODES, StudyTable
+from cprl.studies.tables.tidy_table import StudyTable
 from cprl.studies.trial_progress import Progress
 from cprl.studies.trials import (
     FinishedRuns,
@@ -27,6 +26,7 @@ from cprl.studies.trials import (
     move_aside,
     trials_of,
 )
+from cprl.system.defaults import LAST_EPISODES, WINDOW_EPISODES
 from cprl.system.output import say
 from cprl.values import MOST_INT32, Range, checked, refusal
 
@@ -204,7 +204,7 @@ def _runs_of_another_engine(tasks: Sequence[Task]) -> list[Path]:
     return [run for task in tasks if (run := task.run_of_another_engine()) is not None]
 
 
-def _outcomes(tasks: Sequence[Task], executor: Executor) -> Generator[TrialOutcome, None, None]:
+def _outcomes(tasks: Sequence[Task], executor: Executor) -> Outcomes:
     """Run all trials, and yield their outcomes.
 
     A trial that another process is running is tried again until that process has finished it, or has given no

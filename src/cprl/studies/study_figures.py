@@ -6,6 +6,7 @@ There are three kinds: metrics over a numeric factor (`by_factor`), conditions b
 """
 
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -25,10 +26,10 @@ from cprl.measuring.registry import COLLECTIVE_RETURN, bounds, title
 from cprl.measuring.statistics import Estimate, Family, curve_interval
 from cprl.measuring.table import WINDOWS, by_replica, where
 from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
+from cprl.pictures.readable import capitalised
 from cprl.studies.tables.comparing import (
     INTERVALS,
     Comparison,
-    capitalised,
     compared_metrics,
     condition_differences,
     condition_means,
@@ -49,7 +50,7 @@ from cprl.terminal.style import (
     drawing,
     wrapped,
 )
-from cprl.values import refusal
+from cprl.values import is_number, refusal
 from cprl.values.array_types import Float64
 
 _MOST_CONDITIONS: Final = 60
@@ -164,9 +165,8 @@ def by_factor(
             axes.set_xlabel(factor_word(factor) + ", at equal distances" * layout.is_even)
         sheet.title = f"{design.name}: outcome by {factor_word(factor)}"
         sheet.caption = figure_caption(table, f"{_levels_note(table)} Faint: single replicas.")
-        others = [name for name in design.factors if name != factor]
-        if others and list(layout.lines) == [""]:
-            sheet.caption += f" Conditions differ in {', '.join(map(factor_word, others))} too."
+        if layout.others and list(layout.lines) == [""]:
+            sheet.caption += f" Conditions differ in {', '.join(map(factor_word, layout.others))} too."
     return Path(path)
 
 
@@ -184,13 +184,15 @@ class _FactorLayout:
     """True if levels stand at equal distances."""
     place_of: Mapping[str, float]
     """The place of each condition on the axis."""
+    others: Sequence[str]
+    """The other factors."""
 
 
 def _factor_layout(table: StudyTable, factor: str) -> _FactorLayout:
     """Return the layout of the panels over a factor."""
     design = table.design
-    lines = _lines(table, factor)
     others = [name for name in design.factors if name != factor]
+    lines = _lines(table, factor, others)
     shades: Sequence[Any] = range(len(lines))
     if len(others) == 1:
         shades = [design.conditions[names[0]][others[0]] for names in lines.values()]
@@ -202,6 +204,7 @@ def _factor_layout(table: StudyTable, factor: str) -> _FactorLayout:
         places=places,
         is_even=is_even,
         place_of={name: places[level] for name, level in levels.items()},
+        others=others,
     )
 
 
@@ -212,7 +215,7 @@ def _draw_factor_panel(
     values = values_of(table.windows(), metric)
     place_of = layout.place_of
     random_play = _random_play(table, metric)
-    is_same = _depends_on_place(random_play, place_of)
+    is_same = _is_same_at_each_place(random_play, place_of)
     # A single line has no colour that could tell random play of different conditions apart.
     shows_random = bool(random_play) and (is_same or len(layout.lines) > 1)
     for label, names in layout.lines.items():
@@ -240,7 +243,7 @@ def _draw_factor_panel(
         axes.plot([], [], label=RANDOM_LABEL, **RANDOM_LINE)
 
 
-def _depends_on_place(random_play: Mapping[str, float], at: Mapping[str, float]) -> bool:
+def _is_same_at_each_place(random_play: Mapping[str, float], at: Mapping[str, float]) -> bool:
     """Return whether random play is equal in all conditions at the same level."""
     by_place: dict[float, list[float]] = {}
     for name, value in random_play.items():
@@ -258,11 +261,10 @@ def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
     return {level: level for level in ordered}, False
 
 
-def _replicas_by_level(table: StudyTable, factor: str) -> dict[float, int]:
-    counts: dict[float, int] = {}
+def _replicas_by_level(table: StudyTable, factor: str) -> Counter[float]:
+    counts: Counter[float] = Counter()
     for name in finished_conditions(table):
-        level = table.design.conditions[name][factor]
-        counts[level] = counts.get(level, 0) + table.replicas[name]
+        counts[table.design.conditions[name][factor]] += table.replicas[name]
     return counts
 
 
@@ -283,14 +285,13 @@ def _scale(
         axes.set_xticks(list(places.values()), texts)
 
 
-def _lines(table: StudyTable, factor: str) -> dict[str, list[str]]:
+def _lines(table: StudyTable, factor: str, others: Sequence[str]) -> dict[str, list[str]]:
     """Return the lines of `by_factor`: conditions that differ in this factor only, by their other levels.
 
     The conditions of a line are ordered by their level.
     """
     design = table.design
     names = finished_conditions(table)
-    others = [name for name in design.factors if name != factor]
     lines: dict[str, list[str]] = {}
     for name in names:  # lines are in the order of the conditions
         levels = design.conditions[name]
@@ -306,9 +307,7 @@ def _lines(table: StudyTable, factor: str) -> dict[str, list[str]]:
 
 def is_numeric(levels: Sequence[Any]) -> bool:
     """Return whether there are at least two different levels and all are numbers."""
-    return len(set(levels)) > 1 and all(
-        isinstance(level, int | float) and not isinstance(level, bool) for level in levels
-    )
+    return len(set(levels)) > 1 and all(map(is_number, levels))
 
 
 def is_logarithmic(levels: Sequence[float]) -> bool:
@@ -636,7 +635,7 @@ def _levels_note(table: StudyTable) -> str:
 
 def metric_title(metric: str, levels: Family) -> str:
     """Return the title of a metric, with the number of episodes in which it is undefined, if any."""
-    means = [one for (_, number), one in levels.items() if number == metric]
+    means = levels.column(metric).values()
     undefined = sum(one.undefined for one in means)
     episodes = sum(one.episodes for one in means)
     name = title(metric)

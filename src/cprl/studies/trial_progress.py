@@ -216,7 +216,7 @@ class Progress:
         self._thread.start()
         return self
 
-    def __exit__(self, kind: object, error: object, traceback: object) -> None:
+    def __exit__(self, *error: object) -> None:
         self._is_over.set()
         self._thread.join()
         self._show(is_line=True)

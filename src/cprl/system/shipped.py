@@ -1,6 +1,6 @@
 """The recipes that come with cprl: at the top of a checkout, or in the package that a wheel installs.
 
-A recipe is named by its path without ".py": `commons`, `study/time_out`.
+A recipe is named by its path without ".py": `commons`, `study/exploration`.
 """
 
 import ast
@@ -28,7 +28,7 @@ class Recipe:
     """A recipe that comes with cprl, or a module that recipes share."""
 
     name: str
-    """The path among the recipes without ".py", e.g. "study/time_out"."""
+    """The path among the recipes without ".py", e.g. "study/exploration"."""
     path: Path
     """The file."""
 

@@ -17,6 +17,7 @@ from cprl.measuring.registry import COLLECTIVE_RETURN
 from cprl.measuring.statistics import Estimate, Family, differences, estimates, number_format
 from cprl.measuring.table import by_replica, labelled, where, world_of
 from cprl.measuring.windows import last_of
+from cprl.pictures.readable import capitalised
 from cprl.population import AgentSpec, any_learns, exploring
 from cprl.runs.episodes import read_episodes, read_rows
 from cprl.system.defaults import LAST_EPISODES
@@ -48,36 +49,39 @@ def course_of(run: Path, agents: Sequence[AgentSpec]) -> str:
     if missing := sorted(set(NEEDED) - set(table.column_names)):
         raise ValueError(f"the episodes of {run} lack {', '.join(missing)}; allowed: games that report them")
     learns = any_learns(agents)
-    last_learning = last_of(table, LAST_EPISODES)
     fresh = read_rows(run / "evaluation" / "trained.parquet")
     random = read_rows(run / "evaluation" / "random.parquet")
     phases = {_FRESH: fresh, _RANDOM: random}
     if learns:
-        phases = {_LEARNING: last_learning, **phases}
+        phases = {_LEARNING: last_of(table, LAST_EPISODES), **phases}
     played = pa.concat_tables(labelled(rows.select(_COLUMNS), when=phase) for phase, rows in phases.items())
     levels = estimates(played, NEEDED, "when")
     gaps = differences(played, COLLECTIVE_RETURN, "when", {"when": _RANDOM})
     baseline = "agents who never learned" if learns else _RANDOM
-    random_line = f"Random play gets {_got(levels, _RANDOM)}."
-    if not learns:
-        fresh_line = f"In fresh worlds they get {_got(levels, _FRESH)}."
-        lines = [fresh_line, *_replica_sentences(fresh), random_line]
-        return "\n".join([*lines, _verdict(gaps, baseline)])
-    outcome = outcome_of(table, random=levels[_RANDOM, COLLECTIVE_RETURN].value)
-    lines = [
-        f"The agents began at {outcome.begins:.0f} apples an episode, all together, and reached "
-        f"{outcome.peak:.0f} around episode {outcome.around}.",
-        f"While they learn, in {last_text(table)}, they get {_got(levels, _LEARNING)}.",
-        f"In fresh worlds, where {_fresh_conditions(agents, table)}, they get {_got(levels, _FRESH)}.",
+    lines = []
+    conditions = ""
+    is_tragedy = False
+    if learns:
+        outcome = outcome_of(table, random=levels[_RANDOM, COLLECTIVE_RETURN].value)
+        lines = [
+            f"The agents began at {outcome.begins:.0f} apples an episode, all together, and reached "
+            f"{outcome.peak:.0f} around episode {outcome.around}.",
+            f"While they learn, in {last_text(table)}, they get {_got(levels, _LEARNING)}.",
+        ]
+        conditions = f", where {_fresh_conditions(agents, table)},"
+        is_tragedy = outcome.word == TRAGEDY
+    lines += [
+        f"In fresh worlds{conditions} they get {_got(levels, _FRESH)}.",
         *_replica_sentences(fresh),
-        random_line,
+        f"Random play gets {_got(levels, _RANDOM)}.",
+        _verdict(gaps, baseline, is_tragedy),
     ]
-    return "\n".join([*lines, _verdict(gaps, baseline, is_tragedy=outcome.word == TRAGEDY)])
+    return "\n".join(lines)
 
 
-def last_text(table: pa.Table, number: int = LAST_EPISODES) -> str:
-    """Name the episodes that `last_of` takes, e.g. "the last 2 episodes of each of 16 worlds"."""
-    taken = where(last_of(table, number), agent=0)
+def last_text(table: pa.Table) -> str:
+    """Name the last episodes that a course is about, e.g. "the last 2 episodes of each of 16 worlds"."""
+    taken = where(last_of(table, LAST_EPISODES), agent=0)
     replicas = len(taken["replica"].unique())
     worlds = len(np.unique(world_of(taken))) // replicas
     episodes = len(taken) // replicas // worlds
@@ -131,7 +135,7 @@ def _listed(values: Sequence[float], format_spec: str) -> str:
     return f"{', '.join(firsts)} and {last}"
 
 
-def _verdict(gaps: Family, baseline: str, *, is_tragedy: bool = False) -> str:
+def _verdict(gaps: Family, baseline: str, is_tragedy: bool) -> str:
     """Return how the agents end in comparison with random play, as far as the replicas can tell.
 
     Args:
@@ -172,7 +176,7 @@ def _meaning(verdict_by_phase: Mapping[str, str], baseline: str, undecided: str,
     sentences = []
     for phase, verdict in verdict_by_phase.items():
         if verdict:
-            sentences.append(f"{phase[0].upper()}{phase[1:]} they end {verdict} than {baseline}.")
+            sentences.append(f"{capitalised(phase)} they end {verdict} than {baseline}.")
     sentences += [_unsure(phase) for phase, verdict in verdict_by_phase.items() if not verdict]
     return " ".join(sentences)
 

@@ -61,7 +61,9 @@ def training_curve(
     length = worlds.shape[1]
     window = min(SMOOTHED_EPISODES, max(1, length // _LEAST_WINDOWS))
     averaged_episodes = episodes_per_world(window, lanes) * lanes
-    random_means = {} if random is None else {metric: _mean(random, metric) for metric in metrics}
+    random_means: dict[str, float] = {}
+    if random is not None:
+        random_means = {metric: np.mean(episodes(random, metric)["value"].to_numpy()) for metric in metrics}
     random_label = ", ".join(_amount(metric, mean) for metric, mean in random_means.items())
     path = path or run / "figures" / "training_curve.png"
     evaluations = read_evaluations(run)
@@ -114,10 +116,6 @@ def _panel_metrics(curves: Mapping[str, Float64]) -> list[str]:
 
 def _amount(name: str, value: float) -> str:
     return f"{value:,.4g} {'' if name == INCOME else unit(name)}".rstrip()
-
-
-def _mean(table: pa.Table, name: str) -> float:
-    return float(np.mean(episodes(table, name)["value"].to_numpy()))
 
 
 def _draw(axes: Axes, values: Float64, middle: Float64, means: Float64) -> None:

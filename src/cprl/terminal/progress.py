@@ -3,14 +3,15 @@
 from collections import deque
 from collections.abc import Mapping
 from threading import Event, Thread
-from types import TracebackType
 from typing import Any, Final, Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Column
 from tensordict import TensorDictBase
+from torchrl.envs import EnvBase
 
+from cprl.envs.unwrap import clock_in
 from cprl.measuring.tracker import Episode
 from cprl.runs.schedule import Schedule
 from cprl.system.output import NotebookLine, console as safe_console
@@ -66,10 +67,9 @@ class ProgressBar:
         console: Console | None = None,
     ) -> None:
         self.console = console or safe_console()
-        rules = getattr(getattr(game, "game", game), "rules", None)
         self._title = title
         self._length = schedule.length
-        self._rules_episode_steps = getattr(rules, "episode_steps", None)
+        self._rules_episode_steps = clock_in(getattr(game, "game", game))
         self._episode_steps = self._rules_episode_steps
         """The length of an episode, by which running episodes count in parts."""
         self._progress = Progress(
@@ -124,6 +124,10 @@ class ProgressBar:
         self._unfinished_steps += batch.numel()
         if self._speed.waited_s > self._period_s:
             self._show()
+
+    def on_game(self, env: EnvBase, changes: str) -> None:
+        self._unfinished_steps = 0
+        self.console.print(f"From step {self._steps // self._replicas:,} on: {changes}", soft_wrap=True)
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         self._episodes += 1
@@ -190,9 +194,7 @@ class ProgressBar:
         self._compiling_thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._is_over.set()
         self._compiling_thread.join()
         self._unfinished_steps = 0

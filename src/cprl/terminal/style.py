@@ -21,10 +21,8 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
-from matplotlib.patheffects import Normal, Stroke
 
-from cprl.pictures.colours import agent_colour
-from cprl.runs.files import refuse_to_write_over, write_atomically
+from cprl.runs.files import refuse_to_write_over, write_atomically, write_text
 from cprl.terminal.text_tables import wrap_lines
 from cprl.values import checked, refusal
 
@@ -42,13 +40,22 @@ PNG_SHADES: Final = 256
 CHARACTER: Final = 0.56
 """About the width of a character, in em."""
 _LOOK: Final[dict[str, Any]] = {
-    **dict.fromkeys(("axes.spines.top", "axes.spines.right", "legend.frameon", "text.parse_math"), False),
-    **dict.fromkeys(("axes.edgecolor", "xtick.color", "ytick.color"), "#6b6b6b"),
-    **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor", "axes.labelcolor"), "#222222"),
-    **dict.fromkeys(
-        ("axes.titlesize", "axes.labelsize", "legend.fontsize", "legend.title_fontsize"), "medium"
-    ),
-    **dict.fromkeys(("xtick.labelsize", "ytick.labelsize"), "medium"),
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "text.parse_math": False,
+    "axes.edgecolor": "#6b6b6b",
+    "xtick.color": "#6b6b6b",
+    "ytick.color": "#6b6b6b",
+    "axes.labelcolor": "#222222",
+    "xtick.labelcolor": "#222222",
+    "ytick.labelcolor": "#222222",
+    "axes.titlesize": "medium",
+    "axes.labelsize": "medium",
+    "xtick.labelsize": "medium",
+    "ytick.labelsize": "medium",
+    "legend.fontsize": "medium",
+    "legend.title_fontsize": "medium",
     "axes.titlelocation": "left",
     "axes.axisbelow": True,
     "legend.handlelength": 1.8,
@@ -61,9 +68,8 @@ FIGURE_STYLE: Final = "cprl figures 2"
 """The name of this style in the metadata of every figure. Raise its number when figures change their look."""
 
 MEAN: Final = "#08519c"
-"""The colour of means over replicas; the colours below are of single replicas, intervals and raw values."""
+"""The colour of means over replicas; the colours below are of single replicas and raw values."""
 REPLICA: Final = "#6baed6"
-INTERVAL: Final = "#4292c6"
 RAW: Final = "#b5b5b5"
 RANDOM_LINE: Final[dict[str, Any]] = {"color": "#555555", "linestyle": "--", "linewidth": 1.4, "zorder": 2.5}
 EVALUATED: Final[dict[str, Any]] = {
@@ -85,12 +91,9 @@ MARK: Final = "#a50f15"
 EMPTY: Final = "#f2f2f2"
 """The colour of a cell without a number."""
 DASHES: Final[tuple[Any, ...]] = ("-", (0, (6, 2)), (0, (4, 1, 1, 1)), (0, (1, 1)))
-"""The line styles that distinguish agents of the same colour."""
-_AGENTS_OF_A_DASH: Final = 4
-"""The number of agents with the same line style, which have different colours."""
+"""The line styles that distinguish lines of the same colour."""
 _PAD_IN: Final = 3 / 72
 """The default room of matplotlib's constrained layout above and below a part of a figure, in inches."""
-_EDGE: Final = "#303030"
 _FAINT: Final = "#555555"
 
 
@@ -233,8 +236,7 @@ def drawing(
         path.parent.mkdir(parents=True, exist_ok=True)
         save(sheet.figure, path, colours=colours, title=sheet.title, caption=sheet.caption)
         if width == "column":
-            text = f"{sheet.title}\n\n{sheet.caption}\n".encode("utf-8", "replace")
-            write_atomically(path.with_suffix(".caption.txt"), lambda file: file.write(text))
+            write_text(path.with_suffix(".caption.txt"), f"{sheet.title}\n\n{sheet.caption}\n")
 
 
 def check_picture(path: str | Path, name: str = "path", *, is_new: bool = True) -> Path:
@@ -293,18 +295,6 @@ def _with_colours(drawn: BytesIO, colours: int) -> BytesIO:
 def wrapped(text: str, wide: float, character: float = CHARACTER) -> str:
     """Break a text into lines of at most `wide` em, with characters of about `character` em."""
     return wrap_lines(text, max(4, int(wide / character)))
-
-
-def on_white(agent: int) -> dict[str, Any]:
-    """Return the style of an agent's line on a white background: its colour with a dark edge.
-
-    The edge makes light colours such as yellow visible. Agents 4 and on also have dashes, because their
-    colours repeat.
-    """
-    red, green, blue = agent_colour(agent)
-    edge = [Stroke(linewidth=3.2, foreground=_EDGE), Normal()]
-    dashes = DASHES[agent // _AGENTS_OF_A_DASH % len(DASHES)]
-    return {"color": (red / 255, green / 255, blue / 255), "path_effects": edge, "linestyle": dashes}
 
 
 def draw_cell(axes: Axes, x: int, y: int, colour: Any, text: str) -> None:

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-import numpy as np
 import pyarrow as pa
 from rich.console import Console
 from rich.text import Text
@@ -18,6 +17,7 @@ from cprl.measuring.registry import (
     METRICS,
     with_unit,
 )
+from cprl.measuring.social import are_equal
 from cprl.measuring.statistics import HOLM_NOTE, Family, differences, estimates, notes_on
 from cprl.measuring.table import all_metrics, display_name, where
 from cprl.runs.episodes import LEFT_OUT
@@ -100,8 +100,7 @@ def is_empty_row(name: str, family: Family) -> bool:
     metric = METRICS.get(name)
     is_amount = name.rpartition("/")[2] in AGENT_TOTALS
     is_of_institutions = is_amount if metric is None else metric.is_of_institutions
-    metric_estimates = (estimate for key, estimate in family.items() if key[-1] == name)
-    has_value = any(estimate.replicas and estimate.value for estimate in metric_estimates)
+    has_value = any(estimate.replicas and estimate.value for estimate in family.column(name).values())
     return is_of_institutions and not has_value
 
 
@@ -176,7 +175,7 @@ def _is_repeated(name: str, levels: Family) -> bool:
         return False
     values = [levels[*labels, name].value for labels in levels.labels]
     original_values = [levels[*labels, original].value for labels in levels.labels]
-    return np.allclose(values, original_values, rtol=1e-6, atol=1e-6, equal_nan=True)
+    return are_equal(values, original_values)
 
 
 def _is_idle(levels: Family, policy: str) -> bool:

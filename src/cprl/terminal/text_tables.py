@@ -19,7 +19,7 @@ from rich.console import Console, ConsoleOptions, JustifyMethod, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from cprl.runs.files import refuse_to_write_over, write_atomically
+from cprl.runs.files import refuse_to_write_over, write_text
 from cprl.system.output import OUT, console
 from cprl.values import refusal
 
@@ -148,9 +148,8 @@ def write_tables(tables: Sequence[TextTable], path: str | Path, *, notes: Sequen
     if path.suffix not in WRITERS:
         raise refusal("path", str(path), f"a file whose name ends in {', '.join(WRITERS)}")
     refuse_to_write_over(path)
-    content = WRITERS[path.suffix](tables, notes).encode()
     path.parent.mkdir(parents=True, exist_ok=True)
-    return write_atomically(path, lambda file: file.write(content))
+    return write_text(path, WRITERS[path.suffix](tables, notes))
 
 
 def markdown(table: TextTable) -> list[str]:

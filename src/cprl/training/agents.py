@@ -1,6 +1,6 @@
 """Population: the agents of an experiment that learn, follow a script, or were trained by an earlier run."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any, get_args
 
@@ -13,9 +13,10 @@ from cprl.algorithms.base import Algorithm, TeamAlgorithm, TrainingEngine
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import spaces_of
-from cprl.envs.unwrap import commons_of
+from cprl.envs.unwrap import agent_names, commons_of
 from cprl.learners.lanes import Lanes
 from cprl.learners.protocol import AnyLearner
+from cprl.measuring.registry import OPTIONAL_ENTRIES, reported_by
 from cprl.networks.agent import acting_network
 from cprl.networks.recurrent import state_shape_of
 from cprl.objectives.rewards import reward_name
@@ -23,6 +24,7 @@ from cprl.policies.actors import random_agents
 from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
+from cprl.policies.scripted import RULES_READ, ScriptedActor
 from cprl.population import (
     AgentSpec,
     Frozen,
@@ -278,30 +280,65 @@ def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game
             )
 
 
+def refuse_other_worlds(earlier: EnvBase, env: EnvBase, name: str, others: Iterable[nn.Module]) -> None:
+    """Refuse the worlds of an earlier game, called `name`, in which the agents of `env` could not play.
+
+    Args:
+        others: the actors of the agents that do not learn; scripted ones go by rules of `env`.
+    """
+    games = [None if commons is None else commons.game for commons in map(commons_of, (earlier, env))]
+    pairs: dict[str, tuple[Any, Any]] = {"agents": (agent_names(earlier), agent_names(env))}
+    pairs["a board of cprl:"] = games[0] is not None, games[1] is not None
+    reported = [reported_by(worlds) for worlds in (earlier, env)]
+    for entry in OPTIONAL_ENTRIES:
+        pairs[f"the entry {entry}:"] = entry in reported[0], entry in reported[1]
+    pairs |= _pairs(games[0], spaces_of(earlier), games[1], spaces_of(env))
+    if games[0] is not None and games[1] is not None:
+        pairs["ballots"] = _ballot_choices(games[0]), _ballot_choices(games[1])
+        for actor in others:
+            if isinstance(actor, ScriptedActor):
+                for rule in RULES_READ[actor.policy]:
+                    values = getattr(games[0].rules, rule), getattr(games[1].rules, rule)
+                    pairs[f"for {actor.policy} agents a {rule} of"] = values
+    _refuse_unequal(name, "has", pairs)
+
+
 def _refuse_other_game(
     run: LoadedRun, spaces: Spaces, game: Game | None, *, is_to_decide: bool = False
 ) -> None:
     """Refuse a run that was trained for other observations or actions, or for other ballots if
     `is_to_decide`."""
+    pairs = _pairs(run.game, run.spaces, game, spaces)
+    if game is not None and isinstance(run.game, Game) and is_to_decide and game.ballots:
+        pairs["ballots"] = _ballot_choices(run.game), _ballot_choices(game)
+    _refuse_unequal(f"the agents of {run.path}", "have", pairs)
+
+
+def _pairs(
+    game_there: Any, spaces_there: Spaces, game: Game | None, spaces: Spaces
+) -> dict[str, tuple[Any, Any]]:
+    """Return in words, there and here, what two games must share for the same agents to play both."""
     pairs: dict[str, tuple[Any, Any]] = {
-        "observations": (run.spaces.observation_shape, spaces.observation_shape),
-        "observations of the dtype": (run.spaces.observation_dtype, spaces.observation_dtype),
-        "a number of actions of": (run.spaces.actions, spaces.actions),
+        "observations": (spaces_there.observation_shape, spaces.observation_shape),
+        "observations of the dtype": (spaces_there.observation_dtype, spaces.observation_dtype),
+        "a number of actions of": (spaces_there.actions, spaces.actions),
     }
-    if game is not None and isinstance(run.game, Game):
-        if is_to_decide and game.ballots:
-            pairs["ballots"] = _ballot_choices(run.game), _ballot_choices(game)
+    if game is not None and isinstance(game_there, Game):
         pairs |= {
-            "a form of observation": (run.game.observation, game.observation),
-            "actions": (run.game.actions, game.actions),
-            "channels": (run.game.channels, game.channels),
-            "institutions that show": (run.game.entries_shown, game.entries_shown),
+            "a form of observation": (game_there.observation, game.observation),
+            "actions": (game_there.actions, game.actions),
+            "channels": (game_there.channels, game.channels),
+            "institutions that show": (game_there.entries_shown, game.entries_shown),
         }
         if "scoreboard" in game.score_channels:
-            pairs["a scoreboard of so many agents:"] = run.game.agents, game.agents
+            pairs["a scoreboard of so many agents:"] = game_there.agents, game.agents
+    return pairs
+
+
+def _refuse_unequal(subject: str, verb: str, pairs: Mapping[str, tuple[Any, Any]]) -> None:
     for name, (there, here) in pairs.items():
         if there != here:
-            raise ValueError(f"the agents of {run.path} have {name} {there}; this game has {here}")
+            raise ValueError(f"{subject} {verb} {name} {there}; this game has {here}")
 
 
 def _ballot_choices(game: Game) -> list[tuple[str, tuple[float, ...]]]:
@@ -335,26 +372,32 @@ def _loadable_weights(
             f"{meanings[algorithm.stochastic]}"
         )
     weights = stored.network.state_dict()
-    with torch.random.fork_rng(devices=[]), torch.no_grad():
+    with torch.random.fork_rng(devices=[]):
         network = acting_network(algorithm.make_network(spaces))
         try:
             network.load_state_dict(weights)
         except RuntimeError as error:
             reason = " ".join(str(error).split())
             raise ValueError(f"{where} has another network than {name} here: {reason}") from error
-        torch.manual_seed(0)
-        observation = torch.rand(8, *spaces.observation_shape) * spaces.observation_scale
-        observation = observation.to(getattr(torch, spaces.observation_dtype))
-        shape = state_shape_of(network)
-        state = () if shape is None else (torch.zeros(8, *shape),)
-        outputs = network(observation, *state)
-        stored_outputs = stored.network(observation, *state)
-        pairs = zip(outputs, stored_outputs, strict=True) if state else [(outputs, stored_outputs)]
-        if not all(torch.equal(*pair) for pair in pairs):
+        if not _compute_the_same(network, stored.network, spaces):
             raise ValueError(
                 f"{where} has another network than {name} here: with the same weights the outputs differ"
             )
     return weights
+
+
+@torch.no_grad()
+def _compute_the_same(network: nn.Module, stored: nn.Module, spaces: Spaces) -> bool:
+    """Return whether two networks have the same outputs, and states, for some random observations."""
+    torch.manual_seed(0)
+    observation = torch.rand(8, *spaces.observation_shape) * spaces.observation_scale
+    observation = observation.to(getattr(torch, spaces.observation_dtype))
+    shape = state_shape_of(network)
+    if shape is None:
+        return torch.equal(network(observation), stored(observation))
+    state = torch.zeros(8, *shape)
+    pairs = zip(network(observation, state), stored(observation, state), strict=True)
+    return all(torch.equal(output, stored_output) for output, stored_output in pairs)
 
 
 def _algorithm_of(spec: Learning | Team) -> Algorithm:

@@ -17,18 +17,19 @@ from torchrl.envs import EnvBase
 
 from cprl.commons.game import Game
 from cprl.envs.env_state import load_transforms_state, transforms_state
-from cprl.envs.make_env import make_env
+from cprl.envs.make_env import PlayableGame, make_env
 from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
 from cprl.experiment.engine import engine_of
 from cprl.measuring.playing import Policy, evaluate
 from cprl.measuring.registry import INSTITUTIONS
 from cprl.measuring.table import labelled
-from cprl.measuring.tracker import Episode
+from cprl.measuring.tracker import Episode, try_custom_metrics
 from cprl.runs.episodes import EVALUATIONS, table_of
 from cprl.runs.files import write_listed
-from cprl.training.agents import Population
+from cprl.training.agents import Population, refuse_other_worlds
 from cprl.training.stored import consecutive_groups, stored_policies
+from cprl.values import Custom
 
 
 def make_agents(
@@ -57,21 +58,42 @@ def make_agents(
     return env, population
 
 
+def make_earlier(experiment: Experiment, env: EnvBase, population: Population) -> list[tuple[EnvBase, int]]:
+    """Make the worlds of `Experiment.earlier`, each with its steps; refuse games that differ from that of
+    `env` in what agents observe and do, in what scripted ones go by, or in what they report beside
+    institutions."""
+    made = []
+    for index, part in enumerate(experiment.earlier):
+        earlier = make_worlds(experiment, env.batch_size.numel(), game=part.game, device=experiment.device)
+        name = f"experiment.earlier[{index}].game"
+        refuse_other_worlds(earlier, env, name, population.others.values())
+        try_custom_metrics(experiment.metrics, earlier)
+        made.append((earlier, part.steps))
+    return made
+
+
 def fresh_env(experiment: Experiment) -> EnvBase:
     worlds = experiment.replicas * experiment.evaluation_episodes
     return make_worlds(experiment, worlds, fresh=True, device=experiment.device)
 
 
 def make_worlds(
-    experiment: Experiment, count: int, *, first: int = 0, fresh: bool = False, device: str = "cpu"
+    experiment: Experiment,
+    count: int,
+    *,
+    game: PlayableGame | Custom | None = None,
+    first: int = 0,
+    fresh: bool = False,
+    device: str = "cpu",
 ) -> EnvBase:
     """Return `count` worlds of an experiment's game, with its transforms, from the number `first` on.
 
     Args:
+        game: an earlier game of the experiment instead of the one at the end.
         fresh: whether they are worlds of the evaluation, which no training plays.
     """
     return make_env(
-        experiment.game,
+        experiment.game if game is None else game,
         worlds=count,
         seed=experiment.seed + fresh,
         first_world=first,
@@ -116,7 +138,7 @@ def _restored_generators(device: str) -> Iterator[None]:
 
 class Evaluations:
     """A callback that evaluates agents greedily in fresh episodes every `evaluate_every` episodes of
-    training.
+    training, in the game at the end.
 
     The replicas that have just ended such an episode play `evaluation_episodes` each, always the same ones,
     like `cprl.evaluate_run(run, Fresh(greedy=True, seed=experiment.seed + 1))`. The training itself does not
@@ -128,8 +150,15 @@ class Evaluations:
         self._run = run
         self._experiment = experiment
         self._env = env
+        """The worlds of the training, whose transforms the evaluations share."""
         self._population = population
         self._tables: list[pa.Table] = []
+
+    def on_start(self, training: Any) -> None:
+        self._env = training.env
+
+    def on_game(self, env: EnvBase, changes: str) -> None:
+        self._env = env
 
     def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
         every = self._experiment.evaluate_every
@@ -190,9 +219,11 @@ def _mean_metrics(episodes: Sequence[Episode]) -> dict[str, float]:
 
 
 def is_repeatable(experiment: Experiment) -> bool:
-    """Return whether random play is the same before and after a training: for a `cprl.Game`, which depends on
-    seeds alone, without transforms, which may learn."""
-    return isinstance(experiment.game, Game) and not experiment.transforms
+    """Return whether random play before a training leaves the worlds of the evaluation as random play after
+    it would: in a `cprl.Game`, which depends on seeds alone, without transforms, which may learn, and without
+    ballots, whose results agents see at the start of the next episode."""
+    game = experiment.game
+    return isinstance(game, Game) and not game.ballots and not experiment.transforms
 
 
 def _keeps_decisions(env: EnvBase) -> bool:
@@ -217,7 +248,7 @@ def evaluate_population(
     load_transforms_state(fresh, transforms_state(trained))
     if random is None or not is_repeatable(experiment):
         random = evaluate(fresh, population.random_policy(worlds), metrics=experiment.metrics)
-    elif not _keeps_decisions(trained):
+    else:
         fresh.reset()  # so that trained agents play the second episode of each world
     if _keeps_decisions(trained):
         fresh = fresh_env(experiment)  # so that no decision of random play stays in force

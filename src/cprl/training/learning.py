@@ -74,9 +74,9 @@ class ShapedReturns:
 
     def take(self, world: int) -> Float64:
         """Return the shaped return of each agent of a world, [N], and reset it to 0."""
-        taken: Float64 = self.returns[world].copy()
+        returns: Float64 = self.returns[world].copy()
         self.returns[world] = self._first
-        return taken
+        return returns
 
     def state_dict(self) -> dict[str, Tensor]:
         return {"returns": torch.tensor(self.returns)}
@@ -100,17 +100,17 @@ def learning_numbers(
         turn: their last turn.
         worlds: the worlds W of each replica.
     """
-    learned: list[dict[str, float]] = [{} for _ in ended]
+    by_episode: list[dict[str, float]] = [{} for _ in ended]
     replicas = {world // worlds for world in ended}
     for agents, learner in learners.items():
         means = {replica: losses[agents].take(replica) for replica in replicas}
         values = learner.values(turn).tolist()
-        for world, numbers in zip(ended, learned, strict=True):
-            for place, agent in enumerate(agents):
-                numbers[f"agent_{agent}/loss"] = means[world // worlds][place]
+        for world, numbers in zip(ended, by_episode, strict=True):
+            for agent, loss, value in zip(agents, means[world // worlds], values[world], strict=True):
+                numbers[f"agent_{agent}/loss"] = loss
                 numbers[f"agent_{agent}/epsilon"] = learner.actor.epsilon
-                numbers[f"agent_{agent}/q"] = values[world][place]
-    return learned
+                numbers[f"agent_{agent}/q"] = value
+    return by_episode
 
 
 def check_agents(
@@ -122,14 +122,15 @@ def check_agents(
 ) -> int:
     """Return the number of replicas R; raise a ValueError unless each of N agents has one learner or actor,
     for W worlds of each replica."""
-    everywhere: int = env.batch_size.numel()
-    replicas, left = divmod(everywhere, worlds)
-    if left:
-        raise ValueError(f"worlds is {worlds}; allowed: a divisor of the environment's {everywhere} worlds")
-    taken = sorted(agent for indices in [*learners, *others] for agent in agent_indices(indices))
-    if taken != list(range(agents)):
+    all_worlds: int = env.batch_size.numel()
+    if all_worlds % worlds:
+        raise ValueError(f"worlds is {worlds}; allowed: a divisor of the environment's {all_worlds} worlds")
+    replicas = all_worlds // worlds
+    controlled = sorted(agent for indices in [*learners, *others] for agent in agent_indices(indices))
+    if controlled != list(range(agents)):
         raise ValueError(
-            f"learners and others control the agents {taken}; allowed: each of 0 to {agents - 1} exactly once"
+            f"learners and others control the agents {controlled}; allowed: each of 0 to {agents - 1} "
+            "exactly once"
         )
     for indices, learner in learners.items():
         if learner.agents != agent_indices(indices):

@@ -176,15 +176,17 @@ class FiniteCheck:
 def describe_findings(findings: Iterable[NotFinite]) -> str:
     """Return in words what is not finite: "the loss of agent 1 in replica 0 and the weights of ... are"."""
     ordered = sorted(findings)
-    parts = []
+    subjects = []
     for (what, replica), group in groupby(ordered, key=lambda finding: (finding.what, finding.replica)):
         agents = [str(finding.agent) for finding in group]
         plural = "s" if len(agents) > 1 else ""
-        parts.append(f"the {what} of agent{plural} {', '.join(agents)} in replica {replica}")
-    if len(parts) > _MOST_NAMED:
-        parts[_MOST_NAMED:] = [f"{len(parts) - _MOST_NAMED} more"]
+        subjects.append(f"the {what} of agent{plural} {', '.join(agents)} in replica {replica}")
+    if len(subjects) > _MOST_NAMED:
+        subjects[_MOST_NAMED:] = [f"{len(subjects) - _MOST_NAMED} more"]
+    *others, last = subjects
+    listed = f"{', '.join(others)}, and {last}" if others else last
     is_one = len(ordered) == 1 and ordered[0].what != "weights"
-    return ", and ".join(filter(None, [", ".join(parts[:-1]), parts[-1]])) + (" is" if is_one else " are")
+    return f"{listed} is" if is_one else f"{listed} are"
 
 
 def findings_note(findings: Sequence[NotFinite]) -> str | None:
@@ -204,6 +206,6 @@ def _not_finite(what: str, numbers: NDArray[Any], agents: Sequence[int], step: i
         if isfinite(numbers.sum()):  # the usual case: finite numbers hardly ever have an infinite sum
             return []
     return [
-        NotFinite(what, int(replica), agents[place], step)
-        for replica, place in np.argwhere(~np.isfinite(numbers))
+        NotFinite(what, int(replica), agents[column], step)
+        for replica, column in np.argwhere(~np.isfinite(numbers))
     ]

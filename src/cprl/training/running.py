@@ -66,6 +66,7 @@ from cprl.training.evaluating import (
     Evaluations,
     evaluate_population,
     make_agents,
+    make_earlier,
     random_play,
     write_evaluation,
 )
@@ -175,6 +176,8 @@ class _OpenRun:
     step: Step
     """The step that was due when the run was opened."""
     env: EnvBase
+    earlier: Sequence[tuple[EnvBase, int]]
+    """The worlds of earlier games, see `Experiment.earlier`."""
     population: Population
     observers: Sequence[Any]
     """The callbacks of the experiment and of the caller."""
@@ -195,6 +198,7 @@ def _open_run(
         partners = partners_in(experiment.agents)
         weights = {} if resumed is None else frozen_weights_names(resumed, partners)
         env, population = make_agents(experiment, starts=state in ("missing", "begun"), weights=weights)
+        earlier = make_earlier(experiment, env, population)
     observers = [*map(instantiate, experiment.callbacks), *callbacks]
     check_callbacks(observers)
     metric_words = try_custom_metrics(experiment.metrics, env)
@@ -206,6 +210,7 @@ def _open_run(
         is_new=is_new,
         step=step,
         env=env,
+        earlier=earlier,
         population=population,
         observers=observers,
         metric_words=metric_words,
@@ -385,6 +390,7 @@ class _Stages:
                     decisions=run.population.decisions,
                     callbacks=[evaluations, table, progress_bar, *run.observers, *viewers, *loggers],
                     metrics=run.experiment.metrics,
+                    earlier=run.earlier,
                     checkpointer=checkpointer,
                 )
                 self.save_learned()

@@ -297,31 +297,31 @@ def stored_actors(
         agents: the stored agents of each replica, by index.
         seeds: returns the seeds of the lanes of some `agents`.
         stacks: whether lanes with the very same network are stacked too, so that its values equal, to the
-        last bit,
-            those beside other networks.
+            last bit, those beside other networks.
     """
-    alike: dict[Any, list[int]] = {}
+    indices_by_kind: dict[Any, list[int]] = {}
     for agent in sorted(agents):
-        alike.setdefault(kinds[agent], []).append(agent)
+        indices_by_kind.setdefault(kinds[agent], []).append(agent)
     spaces = playing.spaces if isinstance(playing, Game) else playing
     actors: dict[ActorAgents, nn.Module] = {}
-    for together in alike.values():
-        lanes = list(chain.from_iterable(zip(*map(agents.get, together), strict=True)))
-        first = lanes[0]
-        common: dict[str, Any] = {"seeds": seeds(agents=together), "agents": len(together), "worlds": worlds}
-        if first.scripted is not None:
-            actors[tuple(together)] = scripted_lanes(first.scripted, playing, **common)
+    for indices in indices_by_kind.values():
+        by_replica = zip(*[agents[agent] for agent in indices], strict=True)
+        lanes = list(chain.from_iterable(by_replica))
+        size: dict[str, Any] = {"seeds": seeds(agents=indices), "agents": len(indices), "worlds": worlds}
+        stored = lanes[0]
+        if stored.scripted is not None:
+            actors[tuple(indices)] = scripted_lanes(stored.scripted, playing, **size)
             continue
         networks: list[Any] = [lane.network for lane in lanes]
         actor = LaneActor(
             _apply_together(networks, stacks=stacks),
             spaces.actions,
-            stochastic=first.stochastic,
+            stochastic=stored.stochastic,
             state_cells=state_cells_of(networks[0]),
-            **common,
+            **size,
         )
-        actor.epsilon = first.epsilon
-        actors[tuple(together)] = actor
+        actor.epsilon = stored.epsilon
+        actors[tuple(indices)] = actor
     return actors
 
 

@@ -1,8 +1,10 @@
 """Training: the loop from the first step to the last; train, and what callbacks get."""
 
+from bisect import bisect_right
 from collections import Counter, OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -15,13 +17,14 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import keys, recurrent_state
-from cprl.envs.env_state import env_state, load_env_state
+from cprl.commons.spaces import Spaces
+from cprl.envs.env_state import env_state, load_env_state, load_transforms_state, transforms_state
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.unwrap import commons_of
 from cprl.keys import Turn
 from cprl.learners.protocol import AnyLearner
 from cprl.measuring.series import Observer
-from cprl.measuring.tracker import Episode, tracker_of
+from cprl.measuring.tracker import Episode, example_episode, tracker_of, with_missing
 from cprl.policies.decisions import Decider
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.runs.checkpoints import Checkpointer
@@ -36,7 +39,7 @@ from cprl.training.learning import (
     learning_numbers,
 )
 from cprl.training.nan_check import EVERY_TURNS, FiniteCheck
-from cprl.values import Custom, checked, short_repr
+from cprl.values import Custom, checked, describe_changes, short_repr, to_config
 from cprl.values.array_types import Float64
 
 
@@ -58,6 +61,11 @@ class StepCollector(BaseCollector):
         self.frames_per_batch = env.batch_size.numel()
         self.carried: TensorDictBase | None = None
         """The input of the environment's next step; None before the first step."""
+
+    def play_in(self, env: EnvBase) -> None:
+        """Begin new episodes in other worlds with the next step."""
+        self.env = env
+        self.carried = env.reset()
 
     def iterator(self) -> Iterator[TensorDictBase]:
         if self.carried is None:
@@ -109,6 +117,8 @@ class Training:
         callbacks: called after each turn and each episode, in this order; see `Callback`.
         metrics: custom metrics, see `cprl.measuring.EpisodeTracker`.
         make_collector: makes the collector; those of TorchRL are several times slower, and cannot be resumed.
+        earlier: the worlds that agents play in before those of `env`, in this order, each with the steps of
+            each replica there, see `cprl.Experiment.earlier`.
     """
 
     def __init__(
@@ -122,12 +132,20 @@ class Training:
         callbacks: Sequence[Any] = (),
         metrics: Sequence[Custom] = (),
         make_collector: MakeCollector = StepCollector,
+        earlier: Sequence[tuple[EnvBase, int]] = (),
     ) -> None:
         schedule = checked("schedule", schedule, Schedule)
         spaces = spaces_of(env)
         check_env(env, env.batch_size.numel())
         check_callbacks(callbacks)
-        self.env = env
+        self._envs = [*(earlier_env for earlier_env, _ in earlier), env]
+        """The worlds of all games, in the order in which they are played."""
+        self._changes = list(accumulate(steps for _, steps in earlier))
+        """The steps of each replica at which the next game begins."""
+        for earlier_env in self._envs[:-1]:
+            _refuse_other_spaces(earlier_env, env, spaces)
+        self.env = self._envs[0]
+        """The worlds that are played in now."""
         self.schedule = schedule
         self.learners = dict(learners)
         self.others = dict(others or {})
@@ -141,9 +159,17 @@ class Training:
         actors: dict[ActorAgents, nn.Module] = {
             agents: learner.actor for agents, learner in self.learners.items()
         }
-        self._collector = make_collector(env, JointPolicy({**actors, **self.others}, decisions=decisions))
+        policy = JointPolicy({**actors, **self.others}, decisions=decisions)
+        self._collector = make_collector(self.env, policy)
+        if earlier and not isinstance(self._collector, StepCollector):
+            raise ValueError(
+                f"make_collector is {short_repr(make_collector)}; allowed with earlier: StepCollector"
+            )
         self._batches = iter(self._collector)
-        self._tracker = tracker_of(env, metrics)
+        self._metrics = metrics
+        self._examples = [example_episode(played, metrics) for played in self._envs] if earlier else []
+        """An episode of each game, whose numbers the episodes of all games have."""
+        self._tracker = tracker_of(self.env, metrics)
         self._losses = {agents: LaneLosses(self.replicas, agents) for agents in self.learners}
         self._shaped_returns = ShapedReturns(env.batch_size.numel(), spaces.agents, self.learners)
         for learner in self.learners.values():
@@ -209,22 +235,46 @@ class Training:
     def step(self) -> None:
         """Take the next turns, usually one: act, store, update, measure, record."""
         for batch in self._next_turns():
-            turn = Turn.of(batch)
+            turn = played = Turn.of(batch)
             self.steps += self.schedule.worlds
             turns = self.steps // self.schedule.worlds
+            next_env = self._envs[self._game_at(self.steps)]
+            if next_env is not self.env:
+                batch = _cut(batch)
+                turn = Turn.of(batch)
             with self.times:
                 self._store_turn(turn)
                 if turns % self.schedule.update_every == 0:
                     for _ in range(self.schedule.update_every):
                         self._update_learners()
             self.observer.on_step(batch)
-            ended = self._tracker.add(turn)
+            ended = self._tracker.add(played)
             if ended:
                 self._check_finite(ended, weights=True)
                 learning = self._end_episodes(ended, turn)
                 self._record_episodes(ended, learning)
             elif turns % EVERY_TURNS == 0:
                 self._check_finite()
+            if next_env is not self.env:
+                self._change_game(next_env)
+
+    def _game_at(self, steps: int) -> int:
+        """Return the index of the game that is played after some steps of each replica."""
+        return bisect_right(self._changes, steps)
+
+    def _change_game(self, env: EnvBase) -> None:
+        """Play in other worlds from the next step on, and say so to the callbacks."""
+        changes = _changes_between(self.env, env)
+        for world in range(env.batch_size.numel()):
+            self._shaped_returns.take(world)
+        self._play_in(env)
+        self.observer.on_game(env, changes)
+
+    def _play_in(self, env: EnvBase) -> None:
+        load_transforms_state(env, transforms_state(self.env))
+        self.env = env
+        self._step_collector().play_in(env)
+        self._tracker = tracker_of(env, self._metrics)
 
     def _next_turns(self) -> Sequence[TensorDictBase]:
         """Return the next turns of every world, usually one, [B] each."""
@@ -271,6 +321,7 @@ class Training:
             shaped = self._shaped_returns.take(episode.world)
             number = self._ended_episodes[replica]
             episode = replace(episode, replica=replica, episode=number, wanted_return=shaped)
+            episode = with_missing(episode, self._examples) if self._examples else episode
             if self.decisions is not None and episode.decision is not None:
                 returns = np.where(np.isnan(shaped), episode.return_, shaped)
                 self.decisions.learn(replica, episode.decision, returns)
@@ -351,6 +402,9 @@ class Training:
             )
         self.steps = int(state["steps"])
         self._ended_episodes = list(state["played"])
+        env = self._envs[self._game_at(self.steps)]
+        if env is not self.env:
+            self._play_in(env)
         template = self.env.reset()  # has the form of `carried`; the state of the worlds is loaded below
         load_env_state(self.env, state["env"])
         if state["carried"] is not None:
@@ -362,6 +416,32 @@ class Training:
             if name in state["callbacks"]:  # a resumed training may have another viewer
                 callback.load_state_dict(state["callbacks"][name])
         torch.set_rng_state(state["torch"])
+
+
+def _refuse_other_spaces(earlier: EnvBase, env: EnvBase, spaces: Spaces) -> None:
+    """Refuse worlds of an earlier game that agents made for `env` could not play in."""
+    check_env(earlier, env.batch_size.numel())
+    if spaces_of(earlier) != spaces:
+        raise ValueError(f"earlier has worlds of {spaces_of(earlier)}; allowed: {spaces}, as in env")
+
+
+def _cut(batch: TensorDictBase) -> TensorDictBase:
+    """Return a turn with which all running episodes end as by a time limit."""
+    cut = batch.copy()
+    after = cut["next"].copy()
+    after[keys.DONE] = torch.ones_like(after[keys.DONE])
+    after[keys.TRUNCATED] = after[keys.TRUNCATED] | ~after[keys.TERMINATED]
+    return cut.set("next", after)
+
+
+def _changes_between(before: EnvBase, now: EnvBase) -> str:
+    """Return in words what differs between the games of two environments."""
+    commons_before = commons_of(before)
+    commons = commons_of(now)
+    if commons_before is None or commons is None:
+        return "another game"
+    changes = describe_changes(to_config(commons_before.game), to_config(commons.game), "game")
+    return "; ".join(changes) or "the same game"
 
 
 def _states(parts: Sequence[Any]) -> list[dict[str, Any]]:
@@ -378,6 +458,7 @@ def train(
     callbacks: Sequence[Any] = (),
     metrics: Sequence[Custom] = (),
     make_collector: MakeCollector = StepCollector,
+    earlier: Sequence[tuple[EnvBase, int]] = (),
     checkpointer: Checkpointer | None = None,
 ) -> Training:
     """Train learners for the length of a schedule: in each turn they act, store the turn and update.
@@ -401,6 +482,7 @@ def train(
         callbacks=callbacks,
         metrics=metrics,
         make_collector=make_collector,
+        earlier=earlier,
     )
     training.run(checkpointer)
     return training
@@ -417,6 +499,10 @@ class Callback(Protocol):
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Get a turn of every world, as the collector yields it, [B]."""
+
+    def on_game(self, env: EnvBase, changes: str) -> None:
+        """Get the worlds of the next game, before its first turn, with what differs in words; see
+        `Experiment.earlier`."""
 
     def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
         """Get all episodes that have ended in one turn, with their numbers of learning, before `on_episode`

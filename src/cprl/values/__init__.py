@@ -25,6 +25,7 @@ from typing import (
     Final,
     Literal,
     NamedTuple,
+    TypeGuard,
     TypeVar,
     Union,
     get_args,
@@ -297,6 +298,11 @@ def _to_plain(value: Any) -> Any:
     return value
 
 
+def is_number(value: object) -> TypeGuard[float]:
+    """Return whether a value is a number, which True is not."""
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
 def _to_int(value: Any) -> int:
     """Return an integer, which True is not."""
     if isinstance(value, int) and not isinstance(value, bool):
@@ -307,7 +313,7 @@ def _to_int(value: Any) -> int:
 def _to_float(value: Any) -> float:
     """Return a finite number as a float."""
     try:
-        number = float(value) if isinstance(value, int | float) and not isinstance(value, bool) else None
+        number = float(value) if is_number(value) else None
     except OverflowError:
         number = None
     if number is None or not isfinite(number):

@@ -19,6 +19,8 @@ from cprl.viewer.scene import Scene, windows_of
 Frames = Mapping[str, NDArray[Any]]
 """T frames as columns [T, ...] by name, as `FrameRecorder.take` returns them. Windows hold the classes of
 `cprl.pictures.decoding.classes_seen`."""
+Columns = dict[str, tuple[NDArray[np.intp], Any]]
+"""By the path of an entity: the frames that show it, and its columns there."""
 
 _LINE_RADIUS_CELLS: Final = 0.045
 """Half the width of a line, in cells."""
@@ -180,7 +182,7 @@ def board_styles() -> dict[str, list[Any]]:
     }
 
 
-def frame_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
+def frame_columns(scene: Scene, frames: Frames) -> Columns:
     """Return the contents of T frames by entity: the indices of the frames that have a row, and the columns.
 
     Beams, the stock, and the squares of agents out of play have a row for the first frame and for each frame
@@ -198,7 +200,7 @@ def frame_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.in
     return contents
 
 
-def board_columns(scene: Scene, frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
+def board_columns(scene: Scene, frames: Frames) -> Columns:
     """Return the frames and the columns of the board's parts, as `frame_columns` does, by the part's name."""
     count, agents = frames["in_play"].shape
     all_frames = np.arange(count)
@@ -267,7 +269,7 @@ def _line_columns(lines: Glyphs, frames: Frames) -> Any:
     return rr.LineStrips2D.columns(strips=strips).partition(counts)
 
 
-def _out_of_play_columns(frames: Frames) -> dict[str, tuple[NDArray[np.intp], Any]]:
+def _out_of_play_columns(frames: Frames) -> Columns:
     """Return the columns of a hollow square around each agent out of play, and of its number.
 
     A number is left out where another agent's number stands. A square's label names the agent that tagged

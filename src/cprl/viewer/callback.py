@@ -5,12 +5,13 @@ from math import ceil, gcd
 from operator import methodcaller
 from pathlib import Path
 from threading import Event
-from types import TracebackType
 from typing import Any, Final, Self
 
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
+from cprl.commons.game import Game
+from cprl.commons.maps import Map
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import action_count, agent_names, commons_of
 from cprl.measuring.playing import Policy
@@ -22,14 +23,14 @@ from cprl.runs.episodes import stored_episodes
 from cprl.runs.recipe import custom_rules_in, read_recipe
 from cprl.system.output import console
 from cprl.system.process import on_signals
-from cprl.values.array_types import Float64
+from cprl.values import instantiate
 from cprl.viewer.frames import FrameSchedule, Wall
 from cprl.viewer.header import CompilingNotice, Events, Header, HeaderView
 from cprl.viewer.logger import RerunLogger, recording_id
 from cprl.viewer.page import RECORDING_FILE, recordings_of
 from cprl.viewer.pictures import Pictures, Samples, borders, regions_of
-from cprl.viewer.scene import missing_in, plotted_numbers, scene_of
-from cprl.viewer.view import Exhibit, JointActions, Plots, View
+from cprl.viewer.scene import Scene, missing_in, plotted_numbers, scene_of
+from cprl.viewer.view import Exhibit, JointActions, Learning, Numbers, Plots, View
 
 _MOST_EPISODES_BETWEEN: Final = 50
 """The largest number of episodes between two pictures of visits, stock and Lorenz curve."""
@@ -70,6 +71,7 @@ class ViewerCallback:
             `cprl.experimental.exhibition`; None for no such view.
         file_name: the name of the recording instead of `run.rrd`; this file must not exist.
         is_replay: whether a stored policy is replayed, see `cprl.viewer.scene.Scene`.
+        earlier: the boards of the games that the training plays before that of `env`.
     """
 
     is_extendable = True
@@ -89,6 +91,7 @@ class ViewerCallback:
         exhibit: Exhibit | None = None,
         file_name: str | None = None,
         is_replay: bool = False,
+        earlier: Sequence[Map] = (),
     ) -> None:
         self.env = env
         self._run = run
@@ -97,7 +100,13 @@ class ViewerCallback:
         curves = plotted_numbers(
             env, agent_names(env), reported, episodes=episodes, worlds=worlds, user_metrics=metrics
         )
-        scene = None if commons is None else scene_of(commons, curves, is_replay=is_replay)
+        scene: Scene | None = None
+        if commons is not None:
+            size = (
+                max((board.height for board in earlier), default=0),
+                max((board.width for board in earlier), default=0),
+            )
+            scene = scene_of(commons, curves, is_replay=is_replay, size=size)
         self._earlier = [] if file_name else recordings_of(run)
         new_file = f"run-{len(self._earlier) + 1}.rrd" if self._earlier else RECORDING_FILE
         self.logger = RerunLogger(
@@ -113,7 +122,9 @@ class ViewerCallback:
         self._turn = 0
         self._episode = 0
         """The number of episodes that all replicas have ended."""
+        self._changes_game = bool(earlier)
         recipe = recipe or {}
+        self._custom_rules = custom_rules_in(recipe)
         self.logger.log_hparams({"run": run.name, **recipe})
         events = [f"{title} begins", *missing_in(reported, has_board=scene is not None)]
         if live and scene is None:
@@ -134,9 +145,9 @@ class ViewerCallback:
         if commons is not None:
             self._views += self._board_views(commons, exhibit)
         if not is_replay:
-            game = None if commons is None else commons.game
-            rules = ", ".join(filter(None, (rules_of(game), custom_rules_in(recipe))))
-            header = Header(curves=self.logger.curves, episodes=episodes, rules=rules, is_about=is_about)
+            header = Header(
+                curves=self.logger.curves, episodes=episodes, rules=self._rules(commons), is_about=is_about
+            )
             self._views += self._training_views(commons, header, picture_period)
         self._step_stride = gcd(*(view.stride for view in self._views)) or 1
         """Turns between two calls of the views' `on_step` in episodes without frames."""
@@ -157,6 +168,7 @@ class ViewerCallback:
             run: the run's directory, which holds the recipe already.
         """
         recipe = read_recipe(run)
+        games = [instantiate(part.game) for part in experiment.earlier]
         start_conditions = {name: recipe.get(name) for name in ("command", "started", "git", "versions")}
         return cls(
             run,
@@ -169,12 +181,18 @@ class ViewerCallback:
             recipe={**recipe["experiment"], **start_conditions},
             live=live,
             exhibit=exhibit,
+            earlier=[game.map for game in games if isinstance(game, Game)],
         )
+
+    def _rules(self, commons: CommonsEnv | None) -> str:
+        """Return the institutions and custom rules of the game in words."""
+        game = None if commons is None else commons.game
+        return ", ".join(filter(None, (rules_of(game), self._custom_rules)))
 
     def _board_views(self, commons: CommonsEnv, exhibit: Exhibit | None) -> Iterator[View]:
         """Yield the exhibition, if there is one; log the borders of regions."""
         regions = regions_of(commons)
-        if regions:
+        if regions and not self._changes_game:
             self.logger.log_static("world/regions", borders(regions))
         live = self.logger.live
         if exhibit is not None and live is not None and live.exhibition is not None:
@@ -210,6 +228,8 @@ class ViewerCallback:
 
         The views get the episodes of the run's table, and viewers get the recording so far.
         """
+        if training.env is not self.env:
+            self._show(training.env)
         if not training.steps:
             return
         worlds = self.logger.curves.worlds
@@ -224,6 +244,27 @@ class ViewerCallback:
         for view in self._views:
             view.resumed()
         self.logger.log_text(f"resumed from step {training.steps:,}")
+
+    def on_game(self, env: EnvBase, changes: str) -> None:
+        """Show the worlds of the next game, and an event that says what differs."""
+        self._set_time(self._episode)
+        self.logger.log_text(f"from step {self.logger.step:,} on: {changes}")
+        self._show(env)
+
+    def _show(self, env: EnvBase) -> None:
+        """Show these worlds from now on."""
+        self.env = env
+        commons = commons_of(env)
+        scene = self.logger.scene
+        if self.header_view is not None:
+            self.header_view.change_rules(self._rules(commons))
+        if commons is None or scene is None:
+            return
+        self.logger.log_row("world/regions", borders(regions_of(commons)))
+        scene = scene_of(commons, scene, size=(scene.height, scene.width))
+        self.logger.curves = scene
+        for view in self._views:
+            view.on_board(commons, scene)
 
     def on_step(self, batch: TensorDictBase) -> None:
         """Pass a turn to the views, if its frame is recorded or a view needs it.
@@ -240,13 +281,13 @@ class ViewerCallback:
     def _set_time(self, episode: int) -> None:
         self.logger.set_time(step=self._turn * self.logger.curves.worlds, episode=episode)
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def on_episode(self, episode: Episode, learning: Learning) -> None:
         """Pass an episode of one world to the views."""
         self._set_time(self._episode)
         for view in self._views:
             view.on_episode(episode, learning)
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
+    def on_numbers(self, episode: int, numbers: Numbers) -> None:
         """Log the numbers of an episode that all replicas have ended."""
         self._episode = episode + 1
         self._set_time(episode)
@@ -310,9 +351,7 @@ class ViewerCallback:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for view in self._views:
             view.close()
         self.logger.shutdown()

@@ -1,7 +1,7 @@
 """Frames of the board: which episodes are recorded turn by turn, and the small boards of all replicas."""
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from math import ceil
 from typing import Any, Final, NamedTuple
@@ -21,7 +21,7 @@ from cprl.viewer.board import Frames, boards, image_format
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import DIED, TEXT
 from cprl.viewer.scene import Scene, boards_of, windows_of
-from cprl.viewer.view import View, has_died
+from cprl.viewer.view import Learning, View, has_died
 
 FRAMES_BYTES: Final = 45_000_000
 """About the size of a file's regular frames; the frames after new bests add to it."""
@@ -134,6 +134,11 @@ class FrameSchedule(View):
         self._is_requested = True
         self.is_on = self.is_shown(self._ended)
 
+    def on_board(self, env: CommonsEnv, scene: Scene) -> None:
+        self.close()
+        if self._recorder is not None:
+            self._recorder = FrameRecorder(env, scene)
+
     def on_step(self, batch: TensorDictBase) -> None:
         """Copy a frame if the running episode is recorded."""
         self.frame = None
@@ -150,7 +155,7 @@ class FrameSchedule(View):
         if count >= _MOST_FRAMES or (waited_s > _SEND_PERIOD_S and count >= _FEWEST_FRAMES):
             self.close()
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def on_episode(self, episode: Episode, learning: Learning) -> None:
         if episode.world == 0:
             self._ended += 1
             self.was_on = self.is_on
@@ -228,6 +233,11 @@ class Wall(View):
         logger.log_static("wall/boards", wall_image)
         logger.log_static("wall/labels", self._panels.labels(colours=None))
 
+    def on_board(self, env: CommonsEnv, scene: Scene) -> None:
+        self.close()
+        self._env = env
+        self._scene = scene
+
     def on_step(self, batch: TensorDictBase) -> None:
         frame = self._schedule.frame
         if frame is not None and self._logger.turn % self._step_period == 0:
@@ -237,7 +247,7 @@ class Wall(View):
             if self._logger.is_live:
                 self._log([self._row(self._logger.frames)], live_only=True)
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def on_episode(self, episode: Episode, learning: Learning) -> None:
         """Remember whether the board has died; log the rows of the first world's episode."""
         if episode.world < len(self._died):
             self._died[episode.world] = bool(has_died(episode))

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil, isnan, nan
 from statistics import fmean
 from threading import Event, Thread
@@ -19,12 +19,11 @@ from cprl.measuring.tracker import Episode
 from cprl.measuring.windows import episodes_per_world
 from cprl.system.defaults import LAST_EPISODES
 from cprl.system.times import CLOCK
-from cprl.values.array_types import Float64
 from cprl.viewer.frames import FrameSchedule
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import EXPLORATION_STRIP, HEADER, LABEL_STRIP, SETTLED
 from cprl.viewer.scene import Curves
-from cprl.viewer.view import View, has_died
+from cprl.viewer.view import Learning, Numbers, View, has_died
 
 _HARVEST: Final = logged(COLLECTIVE_RETURN)
 
@@ -161,7 +160,7 @@ class BestTracker:
     LEAST_RATIO = 1.05
     """The smallest ratio of a new best to the last one."""
 
-    def __init__(self, worlds: int = 1) -> None:
+    def __init__(self, worlds: int) -> None:
         self._worlds = worlds
         self._apples: list[float] = []
         self._best = 0.0
@@ -224,7 +223,13 @@ class HeaderView(View):
         """Show a status in the live header before the first episode ends, e.g. "compiling, 12 s so far"."""
         self._logger.show_live(HEADER, self.header.begins(status, self.course.random_play))
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def change_rules(self, rules: str) -> None:
+        """Name other institutions in the header from now on."""
+        self.header = replace(self.header, rules=rules)
+        if not self._ended:
+            self._logger.log_document(HEADER, self.header.begins(BEGINS, self.course.random_play))
+
+    def on_episode(self, episode: Episode, learning: Learning) -> None:
         income = _income(episode)
         died = has_died(episode)
         self.course.add(income, replica=episode.replica, world=episode.world, has_died=died)
@@ -234,7 +239,7 @@ class HeaderView(View):
             block = episode.episode // self._curves.worlds
             self._deaths[block] = self._deaths.get(block, 0) + died
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
+    def on_numbers(self, episode: int, numbers: Numbers) -> None:
         ended_before = self._ended
         self._ended = episode + 1
         died = self._deaths.pop(episode // self._curves.worlds, None)
@@ -346,7 +351,7 @@ class Events(View):
         self._has_seen_death = False
         self._ended = 0
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def on_episode(self, episode: Episode, learning: Learning) -> None:
         if episode.world:
             return
         event = ""
@@ -404,7 +409,7 @@ class CompilingNotice(View):
         """The seconds of compiling before this training."""
         Thread(target=self._watch, daemon=True, name="cprl compiling").start()
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
+    def on_numbers(self, episode: int, numbers: Numbers) -> None:
         self.close()
 
     def close(self) -> None:

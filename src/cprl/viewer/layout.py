@@ -46,6 +46,7 @@ from cprl.pictures.colours import (
 )
 from cprl.pictures.decoding import UNSEEN
 from cprl.pictures.image import EMPTY_SITE_COLOUR
+from cprl.pictures.readable import capitalised
 from cprl.viewer.board import OUT_LINE_RADIUS_CELLS, board_format, board_styles, image_format
 from cprl.viewer.names import (
     BOARD_BACKGROUND,
@@ -411,7 +412,7 @@ def _amounts(curves: Curves, total: str) -> Any:
         total: the name of the amount, which is also that of the metric of all agents together.
     """
     title = METRICS[f"{INSTITUTIONS}{total}"].title.replace(" all,", " each,")
-    return _plot(_sentence(title), _entities(curves.agents, total))
+    return _plot(capitalised(title), _entities(curves.agents, total))
 
 
 def _metrics(curves: Curves, names: Sequence[str]) -> list[Any]:
@@ -478,15 +479,11 @@ def _metric(curves: Curves, metric: str, *, is_explained: bool = False) -> Any:
     if metric not in curves.metrics:
         return None
     entities = [logged(metric), f"{RANDOM_PLAY_FOLDER}/{metric}", f"{EVALUATION_FOLDER}/{metric}"]
-    name = title(metric) if is_custom_metric(metric) else _sentence(title(metric))
+    name = title(metric) if is_custom_metric(metric) else capitalised(title(metric))
     if is_explained:
         name += f"; {curves.bold}"
     is_share = metric in METRICS and METRICS[metric].unit == SHARE_UNIT
     return _plot(name, entities, share=is_share, has_legend=False)
-
-
-def _sentence(text: str) -> str:
-    return text[0].upper() + text[1:]
 
 
 def _plot(name: str, entities: Sequence[str], *, share: bool = False, has_legend: bool = True) -> Any:

@@ -277,7 +277,7 @@ class Live:
 
 
 def open_file(
-    recording_id: str, path: Path, blueprint: Any, *, period_s: float, application: str = RUN_APPLICATION
+    recording_id: str, path: Path, blueprint: Any, *, period_s: float, application: str
 ) -> Stream | None:
     """Return a stream to a new file; warn and return None if the disk is almost full.
 

@@ -130,13 +130,12 @@ def _send_rows(stream: Stream, rows_by_entity: Mapping[str, Sequence[BufferedRow
         times = (steps, episodes, frames)
         if times not in time_columns:
             time_columns[times] = _time_columns(times)
-        columns = _text_columns(values) if isinstance(values[0], str) else _line_columns(values)
+        if isinstance(values[0], str):
+            columns = rr.TextDocument.columns(text=values)
+        else:
+            columns = _line_columns(values)
         recording.send_columns(entity, time_columns[times], columns)
     recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
-
-
-def _text_columns(texts: Sequence[str]) -> Any:
-    return rr.TextDocument.columns(text=list(texts))
 
 
 def _line_columns(rows: Sequence[Sequence[float]]) -> Any:

@@ -24,7 +24,7 @@ from cprl.viewer.board import RIM_CELLS
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import DIED, TEXT
 from cprl.viewer.scene import PLOT_HIGH, PLOT_WIDE, TITLE, Curves, Scene, boards_of
-from cprl.viewer.view import View, has_died
+from cprl.viewer.view import Learning, Numbers, View, has_died
 
 
 class Samples(View):
@@ -40,14 +40,23 @@ class Samples(View):
     """The largest number of samples in an episode."""
 
     def __init__(self, env: CommonsEnv, logger: RerunLogger) -> None:
-        game = env.game
-        now = env.worlds.now
-        boards = logger.curves.boards
+        scene = logger.curves
+        assert isinstance(scene, Scene)
         self._logger = logger
+        self.episode_steps = env.game.rules.episode_steps
+        self.stride = ceil(self.episode_steps / self.MOST_SAMPLES)
+        self.lines: list[list[tuple[int, int]]] = [[] for _ in range(scene.boards)]
+        """The points (turn, stock) of each board's last episode."""
+        self.died = [False] * scene.boards
+        """Whether each board died in its last episode."""
+        self.on_board(env, scene)
+
+    def on_board(self, env: CommonsEnv, scene: Scene) -> None:
+        """Sample these worlds from now on; begin the visits anew."""
+        now = env.worlds.now
+        boards = scene.boards
         self._count = 0
         """The number of samples in the buffer."""
-        self.episode_steps = game.rules.episode_steps
-        self.stride = ceil(self.episode_steps / self.MOST_SAMPLES)
         arrays: list[Any] = [
             now.row[:1],
             now.col[:1],
@@ -60,15 +69,11 @@ class Samples(View):
         ]
         """Each sampled array of the worlds, with the buffer of its samples."""
         self._read = env.worlds.driver.read
-        self.visits = np.zeros((game.agents, game.map.height, game.map.width), np.int64)
+        self.visits = np.zeros((len(scene.agents), scene.height, scene.width), np.int64)
         """int [N, H, W], the samples in which each agent of the first world was on each cell, since the last
         picture."""
         self._running_stock: list[dict[int, int]] = [{} for _ in range(boards)]
         """The stock by turn in the running episode of each board."""
-        self.lines: list[list[tuple[int, int]]] = [[] for _ in range(boards)]
-        """The points (turn, stock) of each board's last episode."""
-        self.died = [False] * boards
-        """Whether each board died in its last episode."""
 
     def on_step(self, batch: TensorDictBase) -> None:
         if self._logger.turn % self.stride:
@@ -89,7 +94,7 @@ class Samples(View):
         for board, stock_by_turn in enumerate(self._running_stock):
             stock_by_turn.update(zip(turn[:, board, 0].tolist(), stock[:, board, 0].tolist(), strict=True))
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def on_episode(self, episode: Episode, learning: Learning) -> None:
         if episode.world >= len(self.lines):
             return
         self.evaluate()
@@ -380,10 +385,10 @@ class Pictures(View):
                     logger.log_static(entity, archetype)
                 logger.log_columns(f"{name}/title", ([0], [0], [0]), notice, live_only=True)
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def on_episode(self, episode: Episode, learning: Learning) -> None:
         self._episodes.append(episode)
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
+    def on_numbers(self, episode: int, numbers: Numbers) -> None:
         ended_before = self._ended
         self._ended = episode + 1
         for name, picture in self._pictures.items():

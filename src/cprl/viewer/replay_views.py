@@ -1,6 +1,6 @@
 """The parts of a replay's recording beside the board: action values, violations and payments in each turn."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from itertools import chain
 from typing import Any, Final
 
@@ -22,6 +22,7 @@ from cprl.viewer.board import centres_of
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import BOARD_BACKGROUND, GIVEN, PAID
 from cprl.viewer.scene import BAR_GAP, BAR_HIGH, BAR_WIDE, Scene, decision_panels
+from cprl.viewer.view import Learning
 
 _DECISIONS: Final = "decisions"
 """The entity of the bars of action values."""
@@ -90,7 +91,7 @@ class Decisions:
         self._images.append(image)
         self._texts += texts
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def on_episode(self, episode: Episode, learning: Learning) -> None:
         count = len(self._images)
         if not count:
             return
@@ -205,7 +206,7 @@ class ViolationMarks:
         # The viewer shows a label when the mouse is on its diamond.
         self._labels.append([describe_violation(agent, fines[agent]) for agent in violators.tolist()])
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def on_episode(self, episode: Episode, learning: Learning) -> None:
         frames = len(self._diamonds)
         if not frames:
             return
@@ -237,16 +238,18 @@ def describe_violation(agent: int, fine: float) -> str:
 
 
 def events(batch: TensorDictBase) -> list[str]:
-    """Return the events of a turn of the first world in words: violations, and fines of tagged agents.
+    """Return the events of a turn of the first world in words: tags, violations, and fines of tagged agents.
 
     Taxes and costs are left out, because many agents pay them in every turn.
     """
     tagged_by = batch.get(("next", *keys.TAGGED_BY), None)
     fines = _amounts_in(batch, FINES_TOTAL)
     violated = _amounts_in(batch, "violated")
-    tagged = np.zeros(len(fines), bool) if tagged_by is None else tagged_by[0].numpy(force=True).any(-1)
-    fined_when_tagged = np.flatnonzero((violated == 0) & (fines > 0) & tagged)
+    tags = [] if tagged_by is None else tagged_by[0].nonzero().tolist()
+    tagged_agents = {agent for agent, _ in tags}
+    fined = np.flatnonzero((violated == 0) & (fines > 0)).tolist()
     return [
+        *(f"agent {tagged} is tagged out by agent {shooter}" for tagged, shooter in tags),
         *(describe_violation(agent, fines[agent]) for agent in np.flatnonzero(violated).tolist()),
-        *(f"agent {agent} fined {fines[agent]:.4g}" for agent in fined_when_tagged.tolist()),
+        *(f"agent {agent} fined {fines[agent]:.4g}" for agent in fined if agent in tagged_agents),
     ]

@@ -1,7 +1,7 @@
 """The contents of a recording: its numbers, its board, and the positions of boards in joint images."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from math import ceil
 from typing import Any, Final
 
@@ -145,9 +145,7 @@ def plotted_numbers(
         user_metrics: the names of the user's metrics.
     """
     mean_over = max(10, round(0.02 * episodes))
-    in_force: tuple[str, ...] = ()
-    if "in_force" in reported:
-        in_force = decisions_of(env)
+    in_force = decisions_of(env) if "in_force" in reported else ()
     joint = joint_actions(env)
     if len(joint) > _MOST_JOINT:
         joint = ()
@@ -163,14 +161,23 @@ def plotted_numbers(
     )
 
 
-def scene_of(env: CommonsEnv, curves: Curves, *, is_replay: bool = False) -> Scene:
-    """Return the board of an environment, together with the numbers that are plotted beside it."""
+def scene_of(
+    env: CommonsEnv, curves: Curves, *, is_replay: bool = False, size: tuple[int, int] = (0, 0)
+) -> Scene:
+    """Return the board of an environment, together with the numbers that are plotted beside it.
+
+    Args:
+        size: the least rows and columns of the picture; what lies beyond the board is wall.
+    """
     board = env.game.map
+    height, width = np.maximum(size, (board.height, board.width)).tolist()
+    beyond = np.ones((height, width), np.bool_)
+    beyond[: board.height, : board.width] = False
     return Scene(
-        **vars(curves),
-        height=board.height,
-        width=board.width,
-        walls=board.walls,
+        **{field.name: getattr(curves, field.name) for field in fields(Curves)},
+        height=height,
+        width=width,
+        walls=(*board.walls, *((row, col) for row, col in np.argwhere(beyond).tolist())),
         sites=board.sites,
         window=env.game.observation_shape[1:],
         caption=_caption(env.game),

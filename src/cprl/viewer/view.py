@@ -15,6 +15,7 @@ from tensordict import TensorDictBase
 from torchrl.envs import EnvBase
 
 from cprl import keys
+from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.playing import Policy
 from cprl.measuring.registry import AGENT_TOTALS, INCOME
 from cprl.measuring.series import ENV_STEPS, GROUP_PREFIXES, Recent, mean_of
@@ -22,6 +23,12 @@ from cprl.measuring.tracker import Episode
 from cprl.values.array_types import Float64
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import JOINT, RANDOM_PLAY_FOLDER
+from cprl.viewer.scene import Scene
+
+Learning = Mapping[str, float]
+"""The numbers of learning of an episode, by their names."""
+Numbers = Mapping[str, Float64]
+"""All numbers of an episode, float64 [R] each, by their names."""
 
 
 class View:
@@ -38,10 +45,13 @@ class View:
     def on_step(self, batch: TensorDictBase) -> None:
         """Look at the worlds after a turn: at every turn with a frame, and at least every `stride` turns."""
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def on_board(self, env: CommonsEnv, scene: Scene) -> None:
+        """Show the worlds of another game from now on, if the view shows worlds."""
+
+    def on_episode(self, episode: Episode, learning: Learning) -> None:
         """Add an episode of one world."""
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
+    def on_numbers(self, episode: int, numbers: Numbers) -> None:
         """Add the numbers of an episode that all replicas have ended; see `cprl.training.Callback`."""
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
@@ -105,7 +115,7 @@ class Plots(View):
                 f"{RANDOM_PLAY_FOLDER}/{name}", ([0, 0], [0, 1], [0, 0]), points, live_only=True
             )
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
+    def on_numbers(self, episode: int, numbers: Numbers) -> None:
         curves = self._logger.curves
         if curves.unit == "return":
             numbers = {**numbers, INCOME: np.sum([numbers[f"{name}/return"] for name in curves.agents], 0)}
@@ -146,14 +156,14 @@ class JointActions(View):
         action = batch[keys.ACTION].cpu().numpy()
         self._counts[self._worlds, action @ self._digit_values] += 1
 
-    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
+    def on_episode(self, episode: Episode, learning: Learning) -> None:
         counts = self._counts[episode.world]
         if counts.any():
             block = episode.episode // self._logger.curves.worlds
             self._shares.setdefault(block, []).append(counts / counts.sum())
         counts[:] = 0
 
-    def on_numbers(self, episode: int, numbers: Mapping[str, Float64]) -> None:
+    def on_numbers(self, episode: int, numbers: Numbers) -> None:
         shares = self._shares.pop(episode // self._logger.curves.worlds, None)
         if shares:
             means = zip(self._recent, np.mean(shares, 0), strict=True)

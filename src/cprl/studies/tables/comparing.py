@@ -10,7 +10,6 @@ from dataclasses import replace
 from math import inf
 from typing import Final, Literal
 
-import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
@@ -22,14 +21,19 @@ from cprl.measuring.registry import (
     is_custom_metric,
     title,
 )
-from cprl.measuring.statistics import CONFIDENCE, CUT_NOTE, Estimate, Family, differences, estimates
-from cprl.measuring.table import by_replica, where
-from cprl.studies.tables.tidy_table import (
-    LAST_EPISODES as LAST_EPISODES,
-    RANDOM_PART,
-    TRAINING_PART,
-    StudyTable,
+from cprl.measuring.social import are_equal
+from cprl.measuring.statistics import (
+    CONFIDENCE,
+    CUT_NOTE,
+    Estimate,
+    Family,
+    differences,
+    estimates,
+    samples_of,
 )
+from cprl.measuring.table import by_replica, where
+from cprl.pictures.readable import capitalised
+from cprl.studies.tables.tidy_table import RANDOM_PART, TRAINING_PART, StudyTable
 from cprl.terminal.text_tables import Change, TableCell, TextTable
 from cprl.values import refusal
 
@@ -47,8 +51,6 @@ INSTITUTION_METRICS: Final = ("institutions/fines", "institutions/violations")
 INTERVALS: Final = f"{CONFIDENCE:.0%} intervals over replicas by Student's t"
 
 Comparison = Literal["levels", "differences"]
-_ROUNDING: Final = 1e-6
-"""The relative rounding error of payments, which are float32."""
 
 
 def condition_means(table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING_PART) -> Family:
@@ -64,9 +66,7 @@ def condition_means(table: StudyTable, metrics: Sequence[str] = (), *, part: str
     return means.changed(lambda key, one: one.of(key[1], clocks.get(key[0], inf)))
 
 
-def condition_differences(
-    table: StudyTable, metrics: Sequence[str] = (), *, part: str = TRAINING_PART
-) -> Family:
+def condition_differences(table: StudyTable, metrics: Sequence[str], *, part: str = TRAINING_PART) -> Family:
     """Return the differences of conditions from the reference condition, by condition and metric."""
     chosen = compared_metrics(table, metrics, part=part)
     reference = {"condition": table.design.reference}
@@ -76,14 +76,11 @@ def condition_differences(
 
 
 def values_of(rows: pa.Table, metric: str) -> dict[str, dict[int, float]]:
-    """Return the mean of a metric in each replica, by condition and replica; replicas without it are left
-    out."""
-    values: dict[str, dict[int, float]] = {}
-    for row in by_replica(rows, metric, ["condition"]).sort_by("replica").to_pylist():
-        by_number = values.setdefault(row["condition"], {})
-        if row["value"] is not None:
-            by_number[row["replica"]] = row["value"]
-    return values
+    """Return the mean of a metric by condition and replica, ascending, of the replicas that have it."""
+    return {
+        condition: dict(sorted(sample.values.items()))
+        for (condition,), sample in samples_of(rows, metric, ["condition"]).items()
+    }
 
 
 def compared_metrics(
@@ -132,9 +129,7 @@ def _are_equal(rows: pa.Table, metric: str, other: str) -> bool:
     places = ["condition", "replica", "episode"]
     if not one.select(places).equals(two.select(places)):
         return False
-    first = one["value"].to_numpy()
-    second = two["value"].to_numpy()
-    return bool(np.allclose(first, second, rtol=_ROUNDING, atol=_ROUNDING, equal_nan=True))
+    return are_equal(one["value"].to_numpy(), two["value"].to_numpy())
 
 
 def episodes_text(table: StudyTable, part: str = TRAINING_PART, *, metric: str | None = None) -> str:
@@ -152,11 +147,6 @@ def pairing_text(table: StudyTable) -> str:
     """Return a text that says whether differences are paired by replica."""
     is_paired = table.design.is_paired
     return "paired by replica" if is_paired else "not paired: each condition has chance of its own"
-
-
-def capitalised(sentence: str) -> str:
-    """Return a sentence with its first letter in upper case."""
-    return f"{sentence[0].upper()}{sentence[1:]}"
 
 
 def condition_table(

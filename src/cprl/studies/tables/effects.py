@@ -13,10 +13,10 @@ from typing import Any, Final
 
 from cprl.measuring.registry import title
 from cprl.measuring.statistics import CellWeights, Family, contrasts, crossed, main_effect, mean_difference
+from cprl.pictures.readable import capitalised
 from cprl.studies.study import level_text, short_names
 from cprl.studies.tables.comparing import (
     INTERVALS,
-    capitalised,
     compared_metrics,
     difference_cell,
     episodes_text,
@@ -26,9 +26,6 @@ from cprl.terminal.text_tables import TextTable
 
 MOST_INTERACTIONS: Final = 24
 """The largest number of interactions. More are left out, since so many tests together show nothing."""
-
-Levels = tuple[Any, Any]
-"""A level of a factor, and the one that it is compared with."""
 
 
 def effect_weights(table: StudyTable) -> dict[str, CellWeights]:
@@ -81,7 +78,7 @@ def _main_effects(design: StudyDesign, factor: str) -> dict[str, CellWeights]:
     }
 
 
-def _compared_levels(design: StudyDesign, factor: str) -> Iterator[Levels]:
+def _compared_levels(design: StudyDesign, factor: str) -> Iterator[tuple[Any, Any]]:
     """Yield each level of a factor with the level that it is compared with."""
     levels = list(dict.fromkeys(design.levels(factor)))
     if all(isinstance(level, bool | int | float) for level in levels):

@@ -12,8 +12,9 @@ from cprl.runs.states import state_of
 from cprl.studies.factors import ALL, normalised, values_at
 from cprl.studies.study import NOT_IN_CHECKSUM, Condition, condition_name, short_names, unique_name
 from cprl.studies.tables.sources import RunSource, clocks_of, plain_level, reason_missing, table_of_sources
-from cprl.studies.tables.tidy_table import WINDOW_EPISODES, StudyDesign, StudyTable, abbreviated
-from cprl.values import describe_changes, refusal, to_config
+from cprl.studies.tables.tidy_table import StudyDesign, StudyTable, abbreviated
+from cprl.system.defaults import WINDOW_EPISODES
+from cprl.values import describe_changes, is_number, refusal, to_config
 
 _MOST_NAMED: Final = 5
 _NOT_COMPARED: Final = (*NOT_IN_CHECKSUM, "evaluation_episodes")
@@ -106,8 +107,7 @@ def _value_at(experiment: Experiment, path: str, run: Path) -> Any:
 
 
 def _rank(value: Any) -> tuple[int, float]:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return (0, float(value)) if is_number else (1, 0.0)
+    return (0, float(value)) if is_number(value) else (1, 0.0)
 
 
 def _refuse_seeds_twice(name: str, experiments: Experiments) -> None:

@@ -15,7 +15,7 @@ from cprl.envs.unwrap import clock_in
 from cprl.experiment import Experiment
 from cprl.measuring.outcome import RULE, outcome_of
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, INSTITUTIONS, METRICS, TOTALS
-from cprl.measuring.table import WINDOWS, by_replica, complete, stored_metrics, where, world_of
+from cprl.measuring.table import ROW_ORDER, WINDOWS, by_replica, complete, stored_metrics, where, world_of
 from cprl.measuring.windows import episodes_after, episodes_per_world
 from cprl.population import any_learns
 from cprl.runs.episodes import read_episodes, read_rows
@@ -31,7 +31,6 @@ from cprl.studies.tables.tidy_table import (
     TABLE_COLUMNS,
     TRAINING_PART,
     UNKNOWN,
-    WINDOW_EPISODES,
     Circumstances,
     MissingRun,
     StudyDesign,
@@ -39,8 +38,9 @@ from cprl.studies.tables.tidy_table import (
     count_circumstances,
 )
 from cprl.studies.trials import DirectoryState, trials_of
+from cprl.system.defaults import WINDOW_EPISODES
 from cprl.system.output import legible
-from cprl.values import Positive, checked
+from cprl.values import Positive, checked, is_number
 from cprl.values.array_types import Int64
 
 REASONS: Final[dict[DirectoryState, str]] = {
@@ -153,9 +153,7 @@ def plain_level(value: Any) -> Any:
     return value if isinstance(value, bool | int | float) else level_text(value)
 
 
-def table_of_sources(
-    design: StudyDesign, sources: Sequence[RunSource], *, window: int = WINDOW_EPISODES
-) -> StudyTable:
+def table_of_sources(design: StudyDesign, sources: Sequence[RunSource], *, window: int) -> StudyTable:
     """Return the table of finished runs.
 
     Args:
@@ -221,7 +219,7 @@ def _tables_of(source: RunSource) -> dict[str, pa.Table]:
     for part, name in RUN_PARTS.items():
         folder = source.run / "evaluation"
         table = read_episodes(source.run) if name is None else read_rows(folder / f"{name}.parquet")
-        table = table.sort_by([(column, "ascending") for column in ("replica", "episode", "agent")])
+        table = table.sort_by(ROW_ORDER)
         _refuse_gaps(table, source, part)
         tables[part] = complete(table)
     return tables
@@ -300,8 +298,9 @@ def _windows(table: pa.Table, source: RunSource, part: str, window: int) -> pa.T
     counts = np.add.reduceat(defined.astype(np.int64), begin, axis=1)
     with np.errstate(invalid="ignore"):
         means = np.add.reduceat(np.where(defined, values, 0.0), begin, axis=1) / counts
+    labels = {"condition": source.condition, "checksum": source.checksum, "run": source.name, "part": part}
     columns = {
-        **{name: [text] * means.size for name, text in _labels_of(source, part).items()},
+        **{name: [text] * means.size for name, text in labels.items()},
         "replica": np.tile(source.first + replica[begin], len(numbers)),
         "metric": np.repeat(list(numbers), len(begin)),
         "episode": np.tile(begin - np.searchsorted(replica, replica[begin]), len(numbers)),
@@ -310,10 +309,6 @@ def _windows(table: pa.Table, source: RunSource, part: str, window: int) -> pa.T
         "value": means.reshape(-1),
     }
     return pa.table({field.name: pa.array(columns[field.name], field.type) for field in _SCHEMA})
-
-
-def _labels_of(source: RunSource, part: str) -> dict[str, str]:
-    return {"condition": source.condition, "checksum": source.checksum, "run": source.name, "part": part}
 
 
 def _places(world: Int64, window: int) -> Int64:
@@ -382,7 +377,7 @@ def _levels(levels: Sequence[Any]) -> pa.Array:
     """Return the levels of all conditions as a column of numbers, of bools, or else of texts."""
     if all(isinstance(level, bool) for level in levels):
         return pa.array(levels, pa.bool_())
-    if all(isinstance(level, int | float) and not isinstance(level, bool) for level in levels):
+    if all(map(is_number, levels)):
         is_whole = all(isinstance(level, int) and abs(level) < 2**63 for level in levels)
         kind = pa.int64() if is_whole else pa.float64()
         return pa.array(levels, kind)

@@ -39,7 +39,7 @@ from cprl.measuring.table import WINDOWS, where
 from cprl.runs.episodes import write_table
 from cprl.runs.files import STUDY_TABLE_FORMAT, refuse_newer
 from cprl.runs.recipe import versions
-from cprl.system.defaults import LAST_EPISODES as LAST_EPISODES, WINDOW_EPISODES as WINDOW_EPISODES
+from cprl.system.defaults import LAST_EPISODES
 from cprl.values import METRIC_WORDS, Positive, checked, refusal
 
 METADATA: Final = b"cprl"
@@ -51,8 +51,17 @@ RUN_PARTS: Final = {TRAINING_PART: None, EVALUATION_PART: "trained", RANDOM_PART
 """The parts of a run: the training, the evaluation of its agents in fresh worlds, and random play in the same
 worlds; with the name of the evaluation's file."""
 TABLE_COLUMNS: Final = (
-    *("condition", "checksum", "run", "marks", "replica", "part", "metric"),
-    *("episode", "window_episodes", "undefined", "value"),
+    "condition",
+    "checksum",
+    "run",
+    "marks",
+    "replica",
+    "part",
+    "metric",
+    "episode",
+    "window_episodes",
+    "undefined",
+    "value",
 )
 """The columns of a table without those of the factors, which follow "checksum"."""
 
