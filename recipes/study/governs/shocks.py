@@ -19,19 +19,16 @@ from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
-from asking import AGENT, EXPERIMENT, GAME, SETTINGS, STEPS, Expectation, expected_text, trained
-from changes import NOTHING, QUOTA, STUDY as CHANGES
+from asking import AGENT, EXPERIMENT, GAME, STEPS, Expectation, expected_text, trained
+from best_response import COPY as VETERAN, RULES as TRAINED
+from changes import QUOTA, STUDY as CHANGES
 from order import HELD, RULES as INSTITUTIONS, under
 
 import cprl
 from cprl import EarlierGame
-from cprl.algorithms import DQN
 from cprl.institutions import Institution
-from cprl.population import Learning
 
 PROBS: Final = tuple((np.array(GAME.rules.regrow_prob) / 2).tolist())
-VETERAN: Final = Learning(DQN(settings=replace(SETTINGS, epsilon_start=0.1)))
-"""Explores as much as at the end of its training."""
 BEFORE: Final[dict[str, tuple[Institution, ...]]] = {
     "no rule": (),
     "quota": INSTITUTIONS["quota 0.25"],
@@ -44,13 +41,6 @@ AFTER: Final[dict[str, tuple[Institution, ...]]] = {
     "sanctions": (replace(HELD[0], share=2 * QUOTA.share), HELD[1]),
 }
 """Half the yield and twice the share: as many apples."""
-TRAINED: Final = {
-    "no rule": NOTHING,
-    "quota": "quota (2)",
-    "sanctions": "sanctions without fines (5)",
-    "tax": "tax of 0.77, shared",
-}
-"""By the name here: the condition of changes.py."""
 UNSHOCKED: Final = {
     "no rule": "order/no tax, then no tax",
     "quota": "order/quota 0.25, then quota 0.25",

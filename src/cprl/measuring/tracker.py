@@ -21,6 +21,7 @@ from cprl.envs.unwrap import agent_count, commons_of
 from cprl.institutions import COUNT_NAMES, Institution
 from cprl.keys import Turn
 from cprl.measuring.registry import (
+    AGENT_TOTALS,
     ENTRY_KEYS,
     IN_FORCE_PREFIX,
     METRICS,
@@ -228,7 +229,7 @@ def with_missing(episode: Episode, others: Sequence[Episode]) -> Episode:
         counts |= {
             name: np.zeros_like(count) for name, count in (other.counts or {}).items() if name not in counts
         }
-        for name in ("fines", "transfers", "violations"):
+        for name in AGENT_TOTALS:
             if getattr(episode, name) is None and getattr(other, name) is not None:
                 totals[name] = np.zeros_like(getattr(other, name))
     return replace(episode, metrics=metrics, counts=counts or None, **totals)
