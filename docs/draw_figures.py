@@ -75,11 +75,13 @@ def draw_theory() -> None:
 
 
 def draw_governs() -> None:
-    """Draw what governs the commons."""
+    """Draw what governs the commons, and write the page of its rows."""
+    import governs_page
     from figure import PICTURES, draw
 
     for name, groups in PICTURES.items():
         draw(RESULTS / "governs" / name, groups)
+    governs_page.main(out=RESULTS / "governs")
 
 
 def draw_studies() -> None:

@@ -21,10 +21,11 @@ from cprl import Experiment
 from cprl.evaluation.film_pictures import write_gif
 from cprl.evaluation.fresh import fresh_episodes, record
 from cprl.evaluation.populations import commons_game
-from cprl.evaluation.show import about, begins, page, show
 from cprl.pictures.image import world_image
 from cprl.pictures.readable import legend_of
 from cprl.population import specs_by_agent
+from cprl.web.scenes import scene_json
+from cprl.web.show import about, begins, page, show
 
 TITLES: Final = {
     "none": "No rule",
@@ -51,8 +52,8 @@ def with_new_words(text: str, experiment: Experiment) -> str:
     game: Any = experiment.game
     specs = specs_by_agent(experiment.agents, game.agents)
     run: Any = SimpleNamespace(experiment=experiment, game=game, specs=specs, networks=specs)
-    population["about"] = about(run)
-    data["axis"] = population["turns"] - 1
+    population |= {"about": about(run), **scene_json(game)}
+    data.pop("palette", None)
     data["legend"] = legend_of([game])
     return page(population["title"], begins(game), data)
 

@@ -32,10 +32,17 @@ BUSY_S = 600.0
 CHROMIUM = (
     *("--headless", "--no-sandbox", "--disable-quic", "--no-first-run", "--disable-background-networking"),
     *("--disable-component-update", "--disable-sync", "--force-color-profile=srgb"),
-    # WebGL by SwiftShader on the CPU; with WebGPU there the web viewer crashes.
-    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"),
     "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1, EXCLUDE localhost",
 )
+WEB_GL = (
+    "--use-gl=angle",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+)
+"""WebGL by SwiftShader on the CPU, a frame a second; with WebGPU there the web viewer crashes."""
+NO_GPU = ("--disable-gpu",)
+"""Pages without WebGL, at the pace of a screen."""
 
 
 @contextmanager
@@ -97,7 +104,9 @@ def steady_picture(client: ViewerClient) -> bytes:
 
 
 @contextmanager
-def browser(page: str, *, size: tuple[int, int] = (1600, 1000)) -> Iterator["Browser"]:
+def browser(
+    page: str, *, size: tuple[int, int] = (1600, 1000), graphics: Sequence[str] = WEB_GL
+) -> Iterator["Browser"]:
     """Headless Chromium with a page open; what is handed out, when called, takes a picture of it, PNG.
 
     Chromium is driven by chromium-driver, which speaks WebDriver: JSON over HTTP, no library is needed.
@@ -115,7 +124,7 @@ def browser(page: str, *, size: tuple[int, int] = (1600, 1000)) -> Iterator["Bro
     address = f"http://127.0.0.1:{port}"
     session = ""
     with tempfile.TemporaryDirectory() as profile:
-        flags = [*CHROMIUM, f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}"]
+        flags = [*CHROMIUM, *graphics, f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}"]
         wanted = {"alwaysMatch": {"goog:chromeOptions": {"args": flags}}}
         try:
             wait_until(lambda: _is_ready(address), START_S, "chromedriver did not answer")
@@ -158,8 +167,11 @@ class Browser:
     def resize(self, width: int, height: int) -> None:
         """Show the page as a device of this size would; windows of Chromium are 500 wide at least."""
         sizes = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
-        command = {"cmd": "Emulation.setDeviceMetricsOverride", "params": sizes}
-        _asked(f"{self._session}/goog/cdp/execute", command)
+        self.command("Emulation.setDeviceMetricsOverride", **sizes)
+
+    def command(self, name: str, **params: Any) -> None:
+        """Have Chromium do what its DevTools can: real keys and fingers, a dark scheme."""
+        _asked(f"{self._session}/goog/cdp/execute", {"cmd": name, "params": params})
 
 
 def _is_ready(address: str) -> bool:

@@ -13,6 +13,7 @@ from typing import Any, Final
 
 import yaml
 
+from cprl.web.explorable import explorable_page
 from website.navigation import sections
 from website.pages import ROOT, stage_pages
 from website.reference import stage_reference
@@ -21,6 +22,8 @@ from website.replays import PAGE as REPLAYS, VIEWER, copy_viewer, stage_replays
 HERE: Final = Path(__file__).parent
 SITE: Final = ROOT / "build" / "site"
 STAGED: Final = ROOT / "build" / "docs"
+EXPLORABLE: Final = "explorable.html"
+"""The page that the home carries."""
 
 
 def main() -> None:
@@ -30,6 +33,7 @@ def main() -> None:
     pages.mkdir(parents=True)
     stage_pages(pages)
     stage_replays(pages)
+    (pages / EXPLORABLE).write_text(explorable_page(), encoding="utf-8")
     shutil.copytree(HERE / "assets", pages / "assets")
     navigation = _navigation(stage_reference(pages))
     config = STAGED / "mkdocs.yml"

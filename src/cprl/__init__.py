@@ -14,7 +14,7 @@ A package imports only from those above it:
     policies     from observations to actions: learned, tabular and scripted agents
     learners     replay and rollouts, updates of many agents at once
     algorithms   what agents learn by: DQN, PPO, QMIX and so on, frozen values
-    population   how each agent is specified: Learning, Team, Scripted, Frozen
+    population   how each agent is specified: Learning, Team, Scripted, Frozen, Person
     measuring    social metrics, episodes, outcomes, statistics
     runs         what is kept of a run: recipe, table of episodes, checkpoints, weights
     experiment   Experiment: what is trained and how, a value; presets: what was published, by name
@@ -22,6 +22,7 @@ A package imports only from those above it:
     terminal     progress, summary, figures
     training     the loop: act, store, update, measure, record; run, load
     evaluation   stored agents in fresh worlds: alone, among each other and people
+    web          boards in a browser: episodes as a page, the explorable, games that people play
     studies      one experiment under many conditions: factors, trials, tables, figures
     commands     the command line
     experimental  the waiting room, which may change and which no other package imports

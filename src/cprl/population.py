@@ -1,5 +1,5 @@
-"""Specifications of agents: `Learning`, `Team`, `Scripted` and `Frozen`, the values that an experiment's
-`agents` holds.
+"""Specifications of agents: `Learning`, `Team`, `Scripted`, `Frozen` and `Person`, the values that an
+experiment's `agents` holds.
 
 A population is a sequence of specifications. A `Team` stands once and names its agents; the other
 specifications stand for one agent each and take the remaining agent indices in order.
@@ -150,7 +150,13 @@ class Scripted(Value):
     policy: ScriptedPolicy = "random"
 
 
-AgentSpec: TypeAlias = Learning | Team | Scripted | Frozen
+@dataclass(frozen=True)
+class Person(Value):
+    """A person, who decides in a hosted game, see `cprl.web`. A run with people has the episodes that they
+    played; it cannot be trained, nor its people played again."""
+
+
+AgentSpec: TypeAlias = Learning | Team | Scripted | Frozen | Person
 """The specification of an agent, or of a team."""
 
 
@@ -159,22 +165,41 @@ def any_learns(specs: Sequence[AgentSpec]) -> bool:
     return any(isinstance(spec, Learning | Team) for spec in specs)
 
 
+def has_people(specs: Sequence[AgentSpec]) -> bool:
+    """Return whether a person is among the agents of a population."""
+    return Person() in specs
+
+
+def refuse_people(specs: Sequence[AgentSpec]) -> None:
+    """Raise a ValueError if a person is among the agents of a population that is to be trained or played."""
+    if has_people(specs):
+        raise ValueError(
+            f"agents[{specs.index(Person())}] is a Person, and people play in hosted games: cprl host; "
+            "allowed: Learning, Team, Scripted, Frozen"
+        )
+
+
 def learned(by_agent: Sequence[AgentSpec]) -> str:
     """Return how the agents of a population learned, in words: "4 agents by DQN, 1 agent by the script
-    'greedy'".
+    'greedy'", "4 people".
 
     Args:
         by_agent: the specification of each agent, see `specs_by_agent`.
     """
     descriptions = [_describe(spec) for spec in by_agent]
     counts = {description: descriptions.count(description) for description in descriptions}
-    return ", ".join(
-        f"{count} agent{'s' * (count > 1)} {description}" for description, count in counts.items()
-    )
+    return ", ".join(_count(description, count) for description, count in counts.items())
+
+
+def _count(description: str, count: int) -> str:
+    """Return how many agents have a description of `_describe`, in words; "" is that of people."""
+    if not description:
+        return f"{count} people" if count > 1 else "1 person"
+    return f"{count} agent{'s' * (count > 1)} {description}"
 
 
 def _describe(spec: AgentSpec) -> str:
-    """Return how an agent learned, in words that follow "agent", e.g. "by QMIX as a team"."""
+    """Return how an agent learned, in words that follow "agent", e.g. "by QMIX as a team"; "" of a person."""
     match spec:
         case Learning() | Team():
             team = " as a team" if isinstance(spec, Team) else ""
@@ -185,6 +210,8 @@ def _describe(spec: AgentSpec) -> str:
             return f"by the script {spec.policy!r}"
         case Frozen():
             return "of an earlier run"
+        case Person():
+            return ""
     return f"by {type(spec).__name__}"
 
 

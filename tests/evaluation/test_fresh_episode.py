@@ -13,7 +13,6 @@ from stored_runs import CORRIDORS, DQN, MEADOW, an_experiment, command, stored
 from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.fresh import averages_of, fresh_episodes, fresh_seed, typical_replica
 from cprl.evaluation.play import open_session, play_in_terminal
-from cprl.evaluation.show import show
 from cprl.runs.recipe import start_run
 from cprl.runs.weights import save_weights
 from cprl.studies.report import report
@@ -21,6 +20,7 @@ from cprl.system.defaults import FILM_SEED, PLAY_SEED
 from cprl.training.evaluating import make_agents
 from cprl.training.stored import load
 from cprl.values import trust
+from cprl.web.show import show
 
 TURNS, APPLES = [9.0, 2.0, 4.0, 14.0], [20.0, 3.0, 11.0, 30.0]
 """Of four replicas in their evaluation. Medians: 6.5 turns, to which 9 and 4 are equally near, and 15.5

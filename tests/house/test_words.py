@@ -37,6 +37,8 @@ REPLACED = {
     "own": "the thing itself",
 }
 """Names that the house replaced, each with the word of the field that it uses instead."""
+SEAT = "seat: say agent"
+"""What may be said of cprl.web, where a seat is a person's place in a hosted game."""
 SEVERAL_HOMES_AT_MOST = 20
 """Public names that several modules define: institutions have the same parts each, and a command is called as
 the function that it calls."""
@@ -122,6 +124,7 @@ def test_no_module_breaks_a_rule_of_statements_and_words(rule):
         f"{path.relative_to(SOURCE)}:{line}: {text}"
         for path, tree in MODULES.items()
         for line, text in rule(tree)
+        if path.parent.name != "web" or text.lower() != SEAT
     ]
     assert breaks == []
 

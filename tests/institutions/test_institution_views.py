@@ -24,6 +24,7 @@ from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sancti
 from cprl.measuring.registry import reported_by
 from cprl.measuring.statistics import estimates, number_format
 from cprl.measuring.table import where
+from cprl.pictures.image import regions_of
 from cprl.policies.actors import random_agents
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
@@ -33,7 +34,7 @@ from cprl.training import Schedule, train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.header import describe_institutions
 from cprl.viewer.layout import layout, styles
-from cprl.viewer.pictures import borders, regions_of
+from cprl.viewer.pictures import borders
 from cprl.viewer.replay_views import ViolationMarks
 from cprl.viewer.scene import Curves, plotted_numbers
 
@@ -321,7 +322,7 @@ def test_every_name_that_is_logged_of_institutions_is_in_the_docs(governed):
 
 
 def test_the_board_shows_whose_the_regions_are(governed):
-    regions = [(owners, cells.sum()) for owners, cells in regions_of(CommonsEnv(GOVERNED, 1))]
+    regions = [(owners, cells.sum()) for owners, cells in regions_of(GOVERNED)]
     assert regions == [([0], 6), ([1], 4), ([2], 2), ([3], 3)]
     strips = static(governed, "world/regions", "LineStrips2D:strips")
     # the sides of 3 x 2, 2 x 2, 2 x 1 and 1 x 3 cells, one line for each
@@ -330,8 +331,8 @@ def test_the_board_shows_whose_the_regions_are(governed):
 
 def test_regions_that_several_agents_share_are_drawn_once():
     shared = Boundaries.drawn("aaaa...\naaaa...\nbbbb...", owners=("a", "a", "b", "ab"))
-    env = CommonsEnv(replace(GAME, institutions=(shared,)), 1)
-    assert [owners for owners, _ in regions_of(env)] == [[0, 1, 3], [2, 3]]
+    game = replace(GAME, institutions=(shared,))
+    assert [owners for owners, _ in regions_of(game)] == [[0, 1, 3], [2, 3]]
 
 
 def test_decisions_have_the_names_of_their_ballots():

@@ -98,7 +98,7 @@ def test_agents_without_values_say_so(played):
         "agent_0: Q 3.00 to 5.00",
         "agent_1: probabilities",
         "agent_2: acts at random",
-        "agent_3: scripted, has no values",
+        "agent_3: has no values",
     ]
 
 

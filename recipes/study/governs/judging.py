@@ -33,6 +33,7 @@ from cprl.commands.recipe_command import exit_with_message
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, title
 from cprl.measuring.statistics import Estimate, difference, estimate, holm
 from cprl.measuring.table import by_replica, where
+from cprl.studies.study import Condition
 from cprl.studies.tables.tidy_table import EVALUATION_PART, TRAINING_PART, StudyTable
 from cprl.values.array_types import Float64
 
@@ -79,6 +80,8 @@ class Outcomes:
         rows = where(self._rows(measure), condition=condition)
         names = rows["metric"].unique().to_pylist()
         name = name_among(names, metric)
+        if measure == MORE_EXPLORATION and name not in names:
+            return {}  # frozen.parquet has the metrics of single agents for some conditions alone
         if names and name not in names:
             raise ValueError(f"metric is {metric!r}; allowed for {condition}: {', '.join(names)}")
         rows = where(rows, metric=name) if measure == MORE_EXPLORATION else by_replica(rows, name)
@@ -282,8 +285,6 @@ def condition_lines(study: Study, outcomes: Outcomes, bounds: Mapping[str, Bound
             continue
         learning = outcomes.values(condition.name, measure=LEARNING)
         more_exploration = outcomes.values(condition.name, measure=MORE_EXPLORATION)
-        harvest = estimate([*outcomes.values(condition.name, COLLECTIVE_RETURN).values()])
-        bound = bound_of(condition.experiment.game, bounds)
         equality = outcomes.values(condition.name, INCOME_EQUALITY)
         turns = outcomes.table.design.clocks.get(condition.name, inf)
         survival = outcomes.values(condition.name, "survival_steps")
@@ -297,13 +298,21 @@ def condition_lines(study: Study, outcomes: Outcomes, bounds: Mapping[str, Bound
                 f"{difference([*frozen.values()], [*learning.values()], paired=True):+}",
                 mean_text(equality, INCOME_EQUALITY),
                 mean_text(survival, "survival_steps", turns),
-                UNMEASURED if bound is None else f"{harvest.value / bound.at_most:.0%}",
-                UNMEASURED if bound is None else f"{harvest.value / bound.best_known:.0%}",
+                *share_texts(condition, outcomes, bounds),
                 exploration_at_end(condition.experiment, outcomes.table.lengths[condition.name]["steps"]),
             ]
         )
     note = "Equality, survival and shares are of frozen agents at 0.05; the best known is that of bounds.csv."
     return section("All conditions", CONDITION_COLUMNS, rows, note)
+
+
+def share_texts(condition: Condition, outcomes: Outcomes, bounds: Mapping[str, Bound]) -> tuple[str, str]:
+    """Return the harvest of frozen agents as a share of the most possible, and of the best known."""
+    bound = bound_of(condition.experiment.game, bounds)
+    if bound is None:
+        return UNMEASURED, UNMEASURED
+    harvest = estimate([*outcomes.values(condition.name, COLLECTIVE_RETURN).values()])
+    return f"{harvest.value / bound.at_most:.0%}", f"{harvest.value / bound.best_known:.0%}"
 
 
 def exploration_lines(study: Study, outcomes: Outcomes) -> list[str]:

@@ -7,4 +7,6 @@ Modules, in the order in which one reads them:
     play_stored     cprl film, show, report, play, evaluate, crossplay and scenarios
     studies         cprl sweep; study_main: the command line of a recipe of a study
     table_command   cprl table
+    host_command    cprl host
+    sandbox_command  cprl sandbox
 """

@@ -316,7 +316,7 @@ def in_shape(experiment: "Experiment", shape: Shape) -> "Experiment":
     if shape.agents is not None:
         board = maps.with_agents(board, shape.agents)
         agents = _as_many(agents, shape.agents)
-    institutions = _institutions(shape.institutions) if shape.institutions else game.institutions
+    institutions = institutions_named(shape.institutions) if shape.institutions else game.institutions
     return replace(experiment, game=replace(game, map=board, institutions=institutions), agents=agents)
 
 
@@ -334,32 +334,50 @@ def _as_many(specs: "tuple[AgentSpec, ...]", agents: int) -> "tuple[AgentSpec, .
     return (first,) * agents
 
 
-def _institutions(names: Sequence[str]) -> "tuple[Institution, ...]":
-    """Return institutions by name, with their defaults, or from JSON files; ["none"] means no institution."""
+def institutions_named(words: Sequence[str], flag: str = "--game.institutions") -> "tuple[Institution, ...]":
+    """Return institutions by name, or from JSON files; ["none"] means no institution.
+
+    Args:
+        words: names, with settings in place of the defaults if any follow, as quota:share=0.5,fine=1; and
+        files.
+        flag: the flag in messages.
+    """
     from cprl.institutions import Institution
-    from cprl.values import KINDS, from_config
+    from cprl.values import KINDS, build, from_config
 
     kinds = {_snake(name): kind for name, kind in KINDS.items() if issubclass(kind, Institution)}
     institutions: list[Institution] = []
-    if list(names) == ["none"]:
+    if list(words) == ["none"]:
         return ()
-    for name in names:
+    for word in words:
+        name, _, settings = word.partition(":")
         kind = kinds.get(name.replace("-", "_"))
-        if name.endswith(".json"):
-            content = json.loads(Path(name).read_text(encoding="utf-8"))
+        if word.endswith(".json"):
+            content = json.loads(Path(word).read_text(encoding="utf-8"))
             tables = content if isinstance(content, list) else [content]
             for number, table in enumerate(tables):
-                institutions.append(from_config(table, f"{name}[{number}]"))
+                institutions.append(from_config(table, f"{word}[{number}]"))
         elif kind is None:
-            raise ValueError(
-                f"--game.institutions is {name}; allowed: {', '.join(sorted(kinds))}, a file .json, or none"
-            )
+            raise ValueError(f"{flag} is {name}; allowed: {', '.join(sorted(kinds))}, a file .json, or none")
         else:
             try:
-                institutions.append(kind())
-            except TypeError as error:  # without an argument that has no default
-                raise ValueError(f"--game.institutions is {name}, {error}; allowed: a file .json") from error
+                institutions.append(build(kind, _settings(settings), name))
+            except ValueError as error:  # without an argument that has no default
+                cure = "" if settings else "; allowed: a file .json"
+                raise ValueError(f"{flag} is {word}: {error}{cure}") from error
     return tuple(institutions)
+
+
+def _settings(text: str) -> dict[str, Any]:
+    """Return the fields in a text such as "share=0.5,fine=1"."""
+    pairs = [pair.partition("=") for pair in text.split(",") if pair]
+    settings: dict[str, Any] = {}
+    for name, _, value in pairs:
+        try:
+            settings[name.replace("-", "_")] = json.loads(value)
+        except ValueError:
+            settings[name.replace("-", "_")] = value
+    return settings
 
 
 def _snake(name: str) -> str:

@@ -46,6 +46,8 @@ _GROUPS: Final[Mapping[str, Mapping[str, str]]] = {
         "show": "play_stored",
         "report": "play_stored",
         "play": "play_stored",
+        "host": "host_command",
+        "sandbox": "sandbox_command",
     },
     "Measure": {
         "evaluate": "play_stored",

@@ -146,7 +146,7 @@ def show(
         raise ValueError("no run is named; allowed: one to six")
     begin_playing(seed, *runs)
 
-    from cprl.evaluation.show import show as show_runs
+    from cprl.web.show import show as show_runs
 
     run, *beside = runs
     which: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed}

@@ -2,14 +2,16 @@
 
 import sys
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import tyro
 
 from cprl.commands.flags import ROWS, TableFiles, TableFlags
-from cprl.runs.recipe import runs_in
+from cprl.runs.recipe import read_recipe, runs_in
 from cprl.system.defaults import LAST_EPISODES, STUDY_TABLE, WINDOW_EPISODES
 from cprl.system.output import OUT, say
 
@@ -55,7 +57,8 @@ def table(
     be left out; it is named.
 
     Args:
-        runs: Directories of runs, or of directories that hold them, with --by; or the directory of a study.
+        runs: Directories of runs, or of directories that hold them, with --by, or where people played some;
+            or the directory of a study.
         by: The path of a field, e.g. game.rules.freeze-steps, agents.*.algorithm.settings.gamma or name; may
             be repeated.
         reference: The name of the condition that others are compared with, e.g. freeze_steps=25; by default
@@ -70,6 +73,8 @@ def table(
         _refuse_beside_csv({"summary": summary, "figures": figures, "reference": reference, **vars(compare)})
     if not runs:
         raise ValueError("cprl table needs at least one run: cprl table RUN... --by FIELD")
+    if not by and not (runs[0] / STUDY_TABLE).exists() and _people_played(runs):
+        by = ("game.institutions", "agents")
     for flag, value in (("--summary", summary), ("--figures", figures)):
         if value and by:
             raise ValueError(f"{flag} is of a study; allowed: without --by, cprl table STUDY {flag}")
@@ -103,6 +108,14 @@ def _refuse_beside_csv(settings: Mapping[str, object]) -> None:
     for name, value in settings.items():
         if value != defaults.get(name):
             raise ValueError(f"--csv prints every row and nothing else; allowed: without --{name}")
+
+
+def _people_played(runs: Sequence[Path]) -> bool:
+    """Return whether people played any of the runs, which are then told apart by treatments and agents."""
+    with suppress(ValueError):  # where some are no runs, a field is asked for
+        agents = chain.from_iterable(read_recipe(run)["experiment"]["agents"] for run in runs_in(runs))
+        return {"kind": "Person"} in agents
+    return False
 
 
 def _pool_runs(

@@ -9,7 +9,6 @@ Modules, in the order in which one reads them:
     fresh           one fresh episode of a run to be filmed or shown, by default a typical one
     film            an episode as a recording for the viewer, or as a GIF or MP4
     film_pictures   the pictures of a film, and the writing of its file
-    show            episodes side by side on an HTML page
     play            an episode in which a person plays among trained or scripted agents
 """
 

@@ -83,7 +83,7 @@ def film(
     refuse_to_write_over(target)
     print_descriptions([fresh])
     target.parent.mkdir(parents=True, exist_ok=True)
-    title = f"{legible(Path(run).name)}, agents of replica {fresh.replica}, fresh episode {fresh.episode}"
+    title = f"{legible(Path(run).name)}, replica {fresh.replica}, episode {fresh.episode}"
     try:
         return target, _record_to_file(fresh, target, title)
     except BaseException:  # the next attempt would refuse to overwrite the recording of half an episode

@@ -2,6 +2,7 @@
 
 The trained agents of a run may do well in one replica and badly in another. By default the episode is
 therefore a typical one, near the medians of the replicas, and its description says how the replicas differ.
+Of a run with people it is one that they played, replayed by the actions that the run keeps.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,12 +25,15 @@ from cprl.measuring.registry import COLLECTIVE_RETURN
 from cprl.measuring.table import where
 from cprl.measuring.tracker import Episode, tracker_of
 from cprl.policies.joint_policy import JointPolicy
-from cprl.runs.episodes import read_rows
+from cprl.policies.recorded_policy import RecordedPolicy
+from cprl.population import has_people
+from cprl.runs.episodes import read_rows, read_table
+from cprl.runs.played import TURNS
 from cprl.system.defaults import FILM_SEED
 from cprl.system.output import say
 from cprl.system.working import working
 from cprl.training.stored import LoadedRun
-from cprl.values import Natural, Range, Seed, checked
+from cprl.values import Natural, Range, Seed, checked, refusal
 
 EPISODES_TRIED: Final = 5
 """The number of fresh episodes from which a typical one is chosen."""
@@ -53,6 +57,8 @@ class FreshEpisode(NamedTuple):
     def description(self) -> str:
         """Return sentences that name the episode and say the averages of the run's trained agents."""
         averages_sentence = averages_in_words(self.run)
+        if has_people(self.run.specs):
+            return f"Group {self.replica}, as people played it. {averages_sentence}"
         if not self.is_typical:
             return f"Replica {self.replica}, episode {self.episode}. {averages_sentence}".rstrip()
         averages = averages_of(self.run)
@@ -65,15 +71,18 @@ class FreshEpisode(NamedTuple):
 
 
 def averages_of(run: LoadedRun) -> dict[int, tuple[float, float]]:
-    """Return the average turns and apples in the evaluation of a run's trained agents, by replica.
+    """Return the average turns and apples of people, or in the evaluation of trained agents, by replica.
 
     Return {} for a run without an evaluation, or in which nobody learned.
     """
     path = run.path / "evaluation" / "trained.parquet"
     metrics = ("survival_steps", COLLECTIVE_RETURN)
-    if not run.networks or not path.is_file():
+    if has_people(run.specs):
+        table = run.episodes()
+    elif run.networks and path.is_file():
+        table = read_rows(path)
+    else:
         return {}
-    table = read_rows(path)
     if not set(metrics) <= set(table.column_names):
         return {}
     groups = where(table, replica=tuple(run.replicas)).group_by("replica")
@@ -94,8 +103,9 @@ def averages_in_words(run: LoadedRun) -> str:
     if not averages:
         return ""
     turns, apples = map(_list_in_words, zip(*averages.values(), strict=True))
-    replicas = f" of the {len(averages)} replicas" if len(averages) > 1 else ""
-    return f"The trained agents{replicas} last {turns} turns on average and pick {apples} apples."
+    agents, noun = ("people", "groups") if has_people(run.specs) else ("trained agents", "replicas")
+    replicas = f" of the {len(averages)} {noun}" if len(averages) > 1 else ""
+    return f"The {agents}{replicas} last {turns} turns on average and pick {apples} apples."
 
 
 def _list_in_words(numbers: Sequence[float]) -> str:
@@ -122,7 +132,7 @@ def fresh_episodes(
 
     Args:
         runs: directories, exported results, or values of `cprl.load`.
-        replica: the number of the replica; 0 by default if `episode` is given.
+        replica: the number of the replica, or group of people; 0 by default if `episode` is given.
         episode: the number of the episode; 0 by default if `replica` is given.
         seed: the seed of the worlds and of all random choices, with which no run may have been trained; by
             default 20011, or the next seed that differs from all training seeds. The same numbers give the
@@ -132,6 +142,9 @@ def fresh_episodes(
     replica = checked("replica", replica, Natural | None)
     seed = checked("seed", seed, Seed | None)
     loaded = [as_loaded(run) for run in runs]
+    for name, value in (("episode", episode), ("seed", seed)):
+        if value is not None and any(has_people(run.specs) for run in loaded):
+            raise refusal(name, value, "None with people, who play no fresh worlds; replica is their group")
     if seed is None:
         seed = fresh_seed(loaded)
     refuse_trained_in(seed, loaded)
@@ -189,8 +202,37 @@ def _fresh(run: LoadedRun, replica: int | None, episode: int, seed: int) -> Fres
     if replica not in run.replicas:
         replicas = ", ".join(map(str, run.replicas))
         raise ValueError(f"replica is {replica}; allowed: {replicas}, the replicas of {run.path}")
+    if has_people(run.specs):
+        return _replayed(run, replica)
     env = run.env(1, seed=seed, first_world=episode)
     return FreshEpisode(run, env, run.policy(replica, seed=seed + episode), replica, episode)
+
+
+def _replayed(run: LoadedRun, group: int) -> FreshEpisode:
+    """Return the episode that a group of people played; refuse turns that give another one."""
+    path = run.path / TURNS
+    if not path.is_file():
+        raise ValueError(f"{path} does not exist; without it people cannot be played again")
+    rows = where(read_table(path), group=group).sort_by([("turn", "ascending"), ("agent", "ascending")])
+    names = ("action", "decision") if run.game.decisions else ("action",)
+    stored = where(run.episodes(), replica=group)
+    steps = stored["steps"][0].as_py()
+    if len(rows) != steps * run.game.agents:
+        raise ValueError(
+            f"{path} has {len(rows)} rows of group {group}; allowed: {steps} turns of all agents"
+        )
+    choices = [rows[name].to_numpy().reshape(steps, 1, -1) for name in names]
+
+    def again() -> FreshEpisode:
+        env = run.env(seed=run.experiment.seed, first_world=group)
+        return FreshEpisode(run, env, RecordedPolicy(*choices), group, 0)
+
+    (episode,) = evaluate(again().env, again().policies)
+    if episode.harvest is None or episode.harvest.tolist() != stored["harvest"].to_pylist():
+        raise ValueError(
+            f"{path} is not what group {group} played: replayed, the harvest is {episode.outcome}"
+        )
+    return again()
 
 
 def _distance(fresh: FreshEpisode) -> float:

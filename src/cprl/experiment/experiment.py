@@ -19,6 +19,7 @@ from cprl.population import (
     Frozen,
     Learning,
     Team,
+    has_people,
     learned,
     refuse_undecided,
     specs_by_agent,
@@ -155,13 +156,15 @@ class Experiment(Value, stored=False, called="experiment"):
     @property
     def trained_for(self) -> str:
         """Return the length and the replicas in words."""
-        return f"trained for {self.length} in {self.trained_in}{self._in_earlier_games}"
+        verb = "played" if has_people(self.agents) else "trained"
+        return f"{verb} for {self.length} in {self.trained_in}{self._in_earlier_games}"
 
     @property
     def trained_in(self) -> str:
         """Return the replicas, and their worlds if there are several, in words."""
         worlds = f" of {self.worlds:,} worlds" if self.worlds > 1 else ""
-        return f"{self.replicas} replica{'s' * (self.replicas > 1)}{worlds}"
+        noun = "group" if has_people(self.agents) else "replica"
+        return f"{self.replicas} {noun}{'s' * (self.replicas > 1)}{worlds}"
 
     @property
     def _in_earlier_games(self) -> str:

@@ -18,7 +18,6 @@ Modules, in the order in which one reads them:
     ray_executor    Ray: runs the trials of a study on the machines of a cluster
     current_policy  CurrentPolicy: the first replica's agents of a training as they are now
     exhibition      a world that the current policy plays, for viewers alone
-    sandbox         an HTML page with sliders, whose agents play at once
     export_turns    fresh episodes for other programs, turn by turn: CSV, Minari
-    commands        cprl egta, exploit, sandbox, schelling, search and visits
+    commands        cprl egta, exploit, schelling, search and visits
 """

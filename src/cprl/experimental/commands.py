@@ -1,4 +1,4 @@
-"""The experimental commands: `cprl egta`, `exploit`, `sandbox`, `schelling`, `search` and `visits`."""
+"""The experimental commands: `cprl egta`, `exploit`, `schelling`, `search` and `visits`."""
 
 import sys
 from collections.abc import Sequence
@@ -32,9 +32,8 @@ from cprl.commands.studies import (
     study_fields,
 )
 from cprl.commons.published import check_board
-from cprl.system.defaults import EGTA_RESAMPLES, SANDBOX_EPISODES, SEED, Fresh
+from cprl.system.defaults import EGTA_RESAMPLES, SEED, Fresh
 from cprl.system.output import say
-from cprl.system.working import working
 
 if TYPE_CHECKING:
     from cprl.experimental.search import SearchResult
@@ -195,29 +194,6 @@ def exploit(
     print_tables(tables)
     say(f"Episodes: {folder / TABLE}")
     files.write(played, tables)
-
-
-def sandbox(*, port: int = 0, out: Path | None = None, episodes: int = SANDBOX_EPISODES) -> None:
-    """Open a page with sliders for people who do not program: rules, boards, scripted agents, trainings.
-
-    Args:
-        port: Of the page, which is on 127.0.0.1 alone; 0 for any that is free.
-        out: Where trainings are kept; by default they are gone when the sandbox is closed.
-        episodes: Of a training.
-    """
-    begin_playing(0)
-
-    with working("starting"):
-        from cprl.experimental.sandbox import Sandbox
-
-    served = Sandbox(out, port=port, episodes=episodes)
-    say(f"{served.address} is open until Ctrl-C")
-    try:
-        served.server.serve_forever()
-    except KeyboardInterrupt:
-        say("closed")
-    finally:
-        served.close()
 
 
 @dataclass(frozen=True, kw_only=True)

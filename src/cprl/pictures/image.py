@@ -6,7 +6,7 @@ the viewer can draw them as lines, both without a font.
 
 from functools import cache
 from itertools import pairwise
-from typing import Annotated, Final
+from typing import Annotated, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from cprl.commons.cells import APPLE, BEAM, CLEANING, GROUND, WALL, WASTE, WATER, Colour
 from cprl.commons.maps import Cell, Map
 from cprl.commons.world import WorldView
+from cprl.institutions import Boundaries
 from cprl.pictures.colours import PALETTE, agent_colour, agent_mark
 from cprl.values import Range, checked
 from cprl.values.array_types import Bool, Float32, UInt8
@@ -186,3 +187,20 @@ def _draw_number(body: UInt8, agent: int, heading: int, *, front: int, back: int
     top = min(max((body_size - height) // 2 + shift * down, 0), body_size - height)
     left = min(max((body_size - width) // 2 + shift * right, 0), body_size - width)
     body[top : top + height, left : left + width][pixels] = INK
+
+
+OwnedRegions: TypeAlias = list[tuple[list[int], Bool]]
+"""The owners of each region, and its cells, bool [H, W]."""
+
+
+def regions_of(game: Any) -> OwnedRegions:
+    """Return the regions of all `Boundaries` of a game that have owners."""
+    regions: OwnedRegions = []
+    for institution in game.institutions:
+        if isinstance(institution, Boundaries):
+            signs = np.array([list(line) for line in institution.regions])
+            agent_signs = [institution.signs_of(agent) for agent in range(game.agents)]
+            for sign in sorted(set("".join(agent_signs))):
+                owners = [agent for agent, signs_of_agent in enumerate(agent_signs) if sign in signs_of_agent]
+                regions.append((owners, signs == sign))
+    return regions

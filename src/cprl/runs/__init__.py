@@ -10,6 +10,7 @@ Modules, in the order in which one reads them:
     checkpoints  the state of a training, to resume from, or to extend
     weights      trained networks, the state of transforms, the values of decisions
     states       the state of a run's directory, and the step that follows: start, resume or extend
+    played       a run of people, finished without a training
     loggers      TorchRL's loggers: TensorBoard, W&B
     export       a finished run, small enough to commit
 """

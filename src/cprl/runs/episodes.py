@@ -69,6 +69,19 @@ def _batch_bytes(batch: pa.RecordBatch, *, is_first: bool) -> bytes:
     return message
 
 
+def append_batch(file: FileIO, batch: pa.RecordBatch, *, is_first: bool) -> None:
+    """Append a batch to a journal, whole or not at all: after half a batch nothing could be read."""
+    end = file.tell()
+    left = memoryview(_batch_bytes(batch, is_first=is_first))
+    try:
+        while left:
+            left = left[file.write(left) :]
+    except BaseException:
+        file.seek(end)
+        file.truncate()
+        raise
+
+
 class EpisodeTable:
     """The table of episodes that is being written; a context manager, and a callback of `cprl.training`.
 
@@ -144,18 +157,11 @@ class EpisodeTable:
             return
         file = self._file or self._open()  # start over if there was no checkpoint
         batch = rows_of(episodes, self._schema or schema_of(episodes[0]))
-        end = file.tell()
-        left = memoryview(_batch_bytes(batch, is_first=self._schema is None))
         try:
-            while left:
-                left = left[file.write(left) :]
-        except BaseException as error:
-            file.seek(end)  # remove half a batch, after which nothing could be read
-            file.truncate()
-            if isinstance(error, OSError):
-                what = f"could not add episodes; the {self._rows} earlier rows are in {self.journal}"
-                raise OSError(error.errno, f"{error.strerror or error}: {what}") from error
-            raise
+            append_batch(file, batch, is_first=self._schema is None)
+        except OSError as error:
+            what = f"could not add episodes; the {self._rows} earlier rows are in {self.journal}"
+            raise OSError(error.errno, f"{error.strerror or error}: {what}") from error
         self._schema = batch.schema
         self._rows += batch.num_rows
 

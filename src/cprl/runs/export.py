@@ -24,13 +24,14 @@ from cprl.runs.files import (
     write_listed,
 )
 from cprl.runs.length import without_length
+from cprl.runs.played import TURNS
 from cprl.runs.recipe import RECIPE_FILE, read_recipe, with_runs_moved
 from cprl.runs.weights import DECISIONS, FROZEN_FIELD, TRANSFORMS
 from cprl.values import describe_changes
 
 _REQUIRED_FILES: Final = (RECIPE_FILE, REPORT)
 _WEIGHTS: Final = f"{CHECKPOINTS}/final.pt"
-_AGENT_FILES: Final = (_WEIGHTS, f"{CHECKPOINTS}/{TRANSFORMS}", f"{CHECKPOINTS}/{DECISIONS}")
+_AGENT_FILES: Final = (_WEIGHTS, f"{CHECKPOINTS}/{TRANSFORMS}", f"{CHECKPOINTS}/{DECISIONS}", TURNS)
 _RUN_FILES: Final = (LOCK_FILE, "run.rrd", "episodes.arrows", "logs", f"{CHECKPOINTS}/*-*.pt")
 """Files of a run that an export does not have."""
 
@@ -43,9 +44,9 @@ def export_results(run: Path, folder: Path, *, weights: bool = True) -> Path:
     Args:
         folder: the target, new, empty, or with an earlier copy of a run of the same experiment, whose files
             are replaced.
-        weights: whether trained weights, most of a short run's size, are copied. Without them a report has
-            the training and its evaluation, but `cprl.load` refuses the copy, since nothing can play its
-            agents.
+        weights: whether trained weights, most of a short run's size, and the turns that people played are
+            copied. Without them a report has the training and its evaluation, but `cprl.load` refuses the
+            copy, since nothing can play its agents.
 
     Returns:
         The folder, which `cprl.load`, `read_episodes` and reports accept like the run. Metrics and returns

@@ -13,6 +13,8 @@ from cprl.runs.weights import frozen_checksums
 RunState = Literal["missing", "begun", "stopped", "finished"]
 Step = Literal["start", "resume", "extend", "already_finished"]
 
+SESSION: Final = "session"
+"""The field of `recipe.json` with the session that a hosted run is a round of."""
 KEEPS_NO_STATE: Final = (
     "it keeps no state of its training to extend it from; a run with --keep-checkpoint does"
 )
@@ -48,15 +50,20 @@ def next_step(state: RunState, length: Length, requested: Length) -> Step:
     return "already_finished" if state == "finished" else "resume"
 
 
-def start(out: Path | None, experiment: Any, partners: Iterable[str]) -> Path:
+def start(out: Path | None, experiment: Any, partners: Iterable[str], *, session: str | None = None) -> Path:
     """Create the directory of a run of an `Experiment`, with its recipe; see `start_run`.
 
     Args:
         partners: the runs whose agents play too, see `cprl.population.partners_in`.
+        session: of a hosted game, what its rounds have in common and no other session has: the same groups of
+            people play them.
     """
-    return start_run(
-        out, experiment.name, lambda run: {**experiment.to_recipe(run), **frozen_checksums(run, partners)}
-    )
+    more = {} if session is None else {SESSION: session}
+
+    def to_recipe(run: Path) -> dict[str, Any]:
+        return {**experiment.to_recipe(run), **frozen_checksums(run, partners), **more}
+
+    return start_run(out, experiment.name, to_recipe)
 
 
 def refuse_to_extend(run: Path, length: Length, callbacks: Iterable[Any]) -> None:

@@ -13,10 +13,11 @@ from markdown_it import MarkdownIt
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import evaluate_run
 from cprl.evaluation.fresh import fresh_episodes
-from cprl.evaluation.show import Page, data_of, page
+from cprl.measuring.table import complete, labelled
 from cprl.pictures.readable import capitalised, growth_of, meaning_of, rule_of, tag_of
-from cprl.population import learned
+from cprl.population import has_people, learned
 from cprl.runs.curves import curves_of
+from cprl.runs.played import TURNS, absence
 from cprl.studies.results import SUMMARY, answer_of
 from cprl.studies.tables.tidy_table import StudyTable
 from cprl.system.defaults import SEED, STUDY_TABLE, Fresh
@@ -28,6 +29,7 @@ from cprl.terminal.summary import comparison_table
 from cprl.terminal.text_tables import markdown
 from cprl.training.stored import LoadedRun, load
 from cprl.values.array_types import Float64
+from cprl.web.show import Page, data_of, page
 
 _LARGEST_SVG_BYTES: Final = 300_000
 
@@ -44,7 +46,8 @@ def report(
 
     Of a run: what happened in sentences; its numbers beside those of random play, which are those of
     `evaluate_run` with the same episodes and seed; the course of its training; an episode to play; its rules
-    and institutions; and its recipe. Of a study: question, expectation, answer, and its summary.
+    and institutions; and its recipe. Of a run with people: the episodes that they played. Of a
+    study: question, expectation, answer, and its summary.
 
     Args:
         path: the directory of a run or of a study, or their results.
@@ -61,10 +64,14 @@ def report(
     page_path = Page(out)
     page_path.refuse()
     is_study = (folder / STUDY_TABLE).is_file()
+    run = None if is_study else load(folder)
+    is_played = run is not None and not has_people(run.specs)
     for name, value, default in (("episodes", episodes, 20), ("seed", seed, SEED)):
-        if is_study and value != default:
-            raise ValueError(f"{name} is {value}, and {folder} is a study; allowed: of a run alone")
-    text = _study_page(folder) if is_study else _run_page(load(folder), episodes, seed)
+        if not is_played and value != default:
+            raise ValueError(
+                f"{name} is {value}, and {folder} is a study, or of people; allowed: of a run of agents alone"
+            )
+    text = _study_page(folder) if run is None else _run_page(run, episodes, seed)
     page_path.write(text)
     return page_path
 
@@ -73,32 +80,45 @@ def _run_page(run: LoadedRun, episodes: int, seed: int) -> str:
     """Return the page of a run."""
     game = run.game
     name = legible(run.experiment.name.replace("_", " "))
-    played = evaluate_run(run, Fresh(episodes=episodes, seed=seed))
+    is_of_people = has_people(run.specs)
     is_commons = isinstance(game, Game)
-    data = data_of(fresh_episodes([run]))[0] if is_commons else None
+    can_show = (run.path / TURNS).exists() if is_of_people else is_commons
+    data = data_of(fresh_episodes([run]))[0] if can_show else None
     before = [growth_of(game)] if is_commons else []
-    curves = _curves(run)
+    curves = {} if is_of_people else _curves(run)
     has_course = set(NEEDED) <= set(curves)
     if has_course and (run.path / "evaluation" / "random.parquet").is_file():
         *facts, meaning = course_of(run.path, run.specs).splitlines()
         before.append("  \n".join([*facts, f"**{meaning}**"]))
     before.append(f"{learned(run.specs)}, {run.experiment.trained_for}.")
     before.append(run.experiment.custom_code)
-    after = [
-        "## Fresh episodes, beside random play",
-        "",
-        *markdown(comparison_table(played, "", names={"trained": "run's agents"})),
-        "These episodes were played for this page, in other worlds than those above, so that means differ by "
-        f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`.",
-    ]
     sections = [
-        _html("\n".join(after)),
+        _html("\n".join(_numbers(run, episodes, seed))),
         *([f"<h2>Training</h2>{_training_figure(run)}"] if curves else []),
         *([_rules(game)] if is_commons else []),
         _recipe(run),
     ]
     after_it = "".join(f"<section>{section}</section>" for section in sections)
     return page(name, _html("\n\n".join(before)), data, after_it)
+
+
+def _numbers(run: LoadedRun, episodes: int, seed: int) -> list[str]:
+    """Return the numbers of fresh episodes beside random play, or of those that people played, as lines of
+    Markdown."""
+    if has_people(run.specs):
+        agents = learned(run.specs)
+        played = labelled(complete(run.episodes()), policy=agents)
+        table = comparison_table(played, "", reference=agents)
+        after = f"Means over groups. {absence(run.path)}"
+        return ["## The episodes that people played", "", *markdown(table), after]
+    played = evaluate_run(run, Fresh(episodes=episodes, seed=seed))
+    return [
+        "## Fresh episodes, beside random play",
+        "",
+        *markdown(comparison_table(played, "", names={"trained": "run's agents"})),
+        "These episodes were played for this page, in other worlds than those above, so that means differ by "
+        f"chance. The same numbers: `cprl evaluate RUN --episodes {episodes} --seed {seed}`.",
+    ]
 
 
 def _curves(run: LoadedRun) -> dict[str, Float64]:
@@ -136,14 +156,19 @@ def _changed(game: Game) -> str:
 
 
 def _recipe(run: LoadedRun) -> str:
-    """Return how to run it again, as HTML."""
+    """Return how it was begun, and how to run it again, which people cannot, as HTML."""
     recipe = json.dumps(run.recipe["experiment"], separators=(", ", ": "))
     began = escape(str(run.recipe.get("command", "")))
+    title = "The recipe"
+    again = ""
+    if not has_people(run.specs):
+        title = "Run it again"
+        again = (
+            "<p>Its directory alone is enough, too, or the recipe below as the <code>experiment</code> of a "
+            "<code>recipe.json</code>:</p><pre>cprl run RUN --out AGAIN</pre>"
+        )
     return (
-        "<h2>Run it again</h2><p>It was begun by this command line:</p>"
-        f"<pre>{began}</pre>"
-        "<p>Its directory alone is enough, too, or the recipe below as the <code>experiment</code> of a "
-        "<code>recipe.json</code>:</p><pre>cprl run RUN --out AGAIN</pre>"
+        f"<h2>{title}</h2><p>It was begun by this command line:</p><pre>{began}</pre>{again}"
         f"<details><summary>The whole recipe</summary><pre>{escape(recipe)}</pre></details>"
     )
 

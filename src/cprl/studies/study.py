@@ -14,6 +14,7 @@ from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from cprl.experiment.engine import engine_of
 from cprl.experiment.experiment import MOST_SEED, Experiment
+from cprl.population import refuse_people
 from cprl.runs.files import STUDY_FORMAT, digest_of, read_json, refuse_newer
 from cprl.runs.recipe import RECIPE_FILE, with_runs_moved
 from cprl.studies.factors import (
@@ -171,6 +172,8 @@ class Study(Value, stored=False):
             raise refusal("design", self.design, "with draws, how many combinations it has")
         if self.blocks[-1].seed > MOST_SEED:
             raise ValueError(f"the experiment's seed is {self.experiment.seed}; allowed: a lower one")
+        for condition in self.all_conditions:
+            refuse_people(condition.experiment.agents)
         names = [condition.name for condition in self.all_conditions]
         if self.reference_name not in names:
             raise refusal("reference", self.reference, f"the name of a condition: {', '.join(names[:10])}")

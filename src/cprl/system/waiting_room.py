@@ -6,7 +6,7 @@
 from importlib import import_module
 from typing import Any, Final
 
-EXPERIMENTAL_COMMANDS: Final = ("egta", "exploit", "sandbox", "schelling", "search", "visits")
+EXPERIMENTAL_COMMANDS: Final = ("egta", "exploit", "schelling", "search", "visits")
 """The names of the experimental commands, which are functions of `cprl.experimental.commands`."""
 EXPERIMENTAL_PARTS: Final = {
     **{name: f"commands:{name}" for name in EXPERIMENTAL_COMMANDS},

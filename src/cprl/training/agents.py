@@ -32,6 +32,7 @@ from cprl.population import (
     Scripted,
     Team,
     grouped,
+    refuse_people,
     refuse_sharing,
     refuse_undecided,
     specs_by_agent,
@@ -83,6 +84,7 @@ class Population:
             raise ValueError(
                 f"engine is {short_repr(engine)}; allowed: {', '.join(map(short_repr, known))}{more}"
             )
+        refuse_people(specs)
         self.spaces = spaces_of(env)
         self.specs = tuple(specs)
         self.seed = seed

@@ -27,7 +27,7 @@ from cprl.policies.decisions import ballot_sizes, stored_decisions
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
-from cprl.population import AgentSpec, Frozen, Learning, Scripted, Team, specs_by_agent
+from cprl.population import AgentSpec, Frozen, Learning, Person, Scripted, Team, specs_by_agent
 from cprl.runs.checkpoints import CHECKPOINTS
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, warn_of_changes
@@ -129,6 +129,11 @@ class LoadedRun:
         spec = self.specs[agent]
         if isinstance(spec, Scripted):
             return StoredAgent(scripted=spec.policy)
+        if isinstance(spec, Person):
+            raise ValueError(
+                f"agent {agent} of {self.path} is a person: people cannot be played again; allowed: cprl "
+                "table, report, show and film, which read what they played"
+            )
         if isinstance(spec, Frozen):
             if spec.run not in self._earlier:
                 weights = frozen_weights_name(self.recipe, self.path, spec.run)

@@ -18,6 +18,7 @@ from cprl.measuring.playing import Policy
 from cprl.measuring.registry import reported_by
 from cprl.measuring.series import Observer
 from cprl.measuring.tracker import Episode, custom_metric_name
+from cprl.pictures.image import regions_of
 from cprl.pictures.readable import rules_of
 from cprl.runs.episodes import stored_episodes
 from cprl.runs.recipe import custom_rules_in, read_recipe
@@ -28,7 +29,7 @@ from cprl.viewer.frames import FrameSchedule, Wall
 from cprl.viewer.header import CompilingNotice, Events, Header, HeaderView
 from cprl.viewer.logger import RerunLogger, recording_id
 from cprl.viewer.page import RECORDING_FILE, recordings_of
-from cprl.viewer.pictures import Pictures, Samples, borders, regions_of
+from cprl.viewer.pictures import Pictures, Samples, borders
 from cprl.viewer.scene import Scene, missing_in, plotted_numbers, scene_of
 from cprl.viewer.view import Exhibit, JointActions, Learning, Numbers, Plots, View
 
@@ -191,7 +192,7 @@ class ViewerCallback:
 
     def _board_views(self, commons: CommonsEnv, exhibit: Exhibit | None) -> Iterator[View]:
         """Yield the exhibition, if there is one; log the borders of regions."""
-        regions = regions_of(commons)
+        regions = regions_of(commons.game)
         if regions and not self._changes_game:
             self.logger.log_static("world/regions", borders(regions))
         live = self.logger.live
@@ -260,7 +261,7 @@ class ViewerCallback:
             self.header_view.change_rules(self._rules(commons))
         if commons is None or scene is None:
             return
-        self.logger.log_row("world/regions", borders(regions_of(commons)))
+        self.logger.log_row("world/regions", borders(regions_of(commons.game)))
         scene = scene_of(commons, scene, size=(scene.height, scene.width))
         self.logger.curves = scene
         for view in self._views:

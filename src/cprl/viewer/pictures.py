@@ -16,9 +16,9 @@ from tensordict import TensorDictBase
 
 from cprl.commons.cells import GROUND, WALL
 from cprl.envs.commons_env import CommonsEnv
-from cprl.institutions import Boundaries
 from cprl.measuring.tracker import Episode
 from cprl.pictures.colours import GREEN, GREY, ORANGE, PALETTE, PURPLE, agent_colour
+from cprl.pictures.image import OwnedRegions
 from cprl.values.array_types import Bool, Float32, Float64, Int64, UInt8
 from cprl.viewer.board import RIM_CELLS
 from cprl.viewer.logger import RerunLogger
@@ -425,25 +425,10 @@ class Pictures(View):
             self._logger.log_row(entity, archetype)
 
 
-OwnedRegions: TypeAlias = list[tuple[list[int], Bool]]
-"""The owners of each region, and its cells, bool [H, W]."""
 _BORDER_OPACITY: Final = 170
 """The alpha channel of borders, 0 to 255."""
 _BORDER_INSET_CELLS: Final = 0.08
 _BORDER_RADIUS_CELLS: Final = 0.04
-
-
-def regions_of(env: CommonsEnv) -> OwnedRegions:
-    """Return the regions of all `Boundaries` of a game that have owners."""
-    regions: OwnedRegions = []
-    for institution in env.game.institutions:
-        if isinstance(institution, Boundaries):
-            signs = np.array([list(line) for line in institution.regions])
-            agent_signs = [institution.signs_of(agent) for agent in range(env.game.agents)]
-            for sign in sorted(set("".join(agent_signs))):
-                owners = [agent for agent, signs_of_agent in enumerate(agent_signs) if sign in signs_of_agent]
-                regions.append((owners, signs == sign))
-    return regions
 
 
 def borders(regions: OwnedRegions) -> Any:

@@ -138,7 +138,7 @@ def _bars(actor: nn.Module, batch: TensorDictBase, agents: list[int]) -> list[tu
     An agent without action values or probabilities has no heights.
     """
     if not isinstance(actor, LaneActor):
-        return [([], "scripted, has no values")] * len(agents)
+        return [([], "has no values")] * len(agents)
     inputs = [batch[keys.OBSERVATION][:, agents]]
     if actor.state_cells:
         all_worlds = slice(None)

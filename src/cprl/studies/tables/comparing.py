@@ -135,6 +135,16 @@ def _are_equal(rows: pa.Table, metric: str, other: str) -> bool:
 def episodes_text(table: StudyTable, part: str = TRAINING_PART, *, metric: str | None = None) -> str:
     """Return a text for the episodes that are compared, e.g. "the last 30 episodes of training"."""
     played = by_replica(table.windows(part), metric or table.metrics[0], ["condition"])
+    is_of_people = pc.is_in(played["condition"], pa.array(table.hosted_conditions, pa.string()))
+    texts = ["the episodes that people played"] * bool(pc.any(is_of_people).as_py())
+    played = played.filter(pc.invert(is_of_people))
+    if len(played):
+        texts = [_trained_text(table, part, played), *texts]
+    return " and ".join(texts) or "no episodes"
+
+
+def _trained_text(table: StudyTable, part: str, played: pa.Table) -> str:
+    """Return a text for the episodes of conditions that were trained."""
     low, high = pc.min_max(played["episodes"]).as_py().values()
     number = f"{high}" if low == high else f"{low} to {high}"
     if part == TRAINING_PART:

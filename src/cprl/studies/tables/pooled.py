@@ -1,14 +1,16 @@
 """Tables of any runs at hand, grouped by the values that fields of their experiments have."""
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import accumulate, combinations
 from pathlib import Path
 from typing import Any, Final
 
 from cprl.experiment import Experiment
+from cprl.population import has_people, learned, specs_by_agent
+from cprl.runs.played import absence
 from cprl.runs.recipe import read_recipe, runs_in
-from cprl.runs.states import state_of
+from cprl.runs.states import SESSION, state_of
 from cprl.studies.factors import ALL, normalised, values_at
 from cprl.studies.study import NOT_IN_CHECKSUM, Condition, condition_name, short_names, unique_name
 from cprl.studies.tables.sources import RunSource, clocks_of, plain_level, reason_missing, table_of_sources
@@ -17,6 +19,7 @@ from cprl.system.defaults import WINDOW_EPISODES
 from cprl.values import describe_changes, is_number, refusal, to_config
 
 _MOST_NAMED: Final = 5
+_AGENTS: Final = "agents"
 _NOT_COMPARED: Final = (*NOT_IN_CHECKSUM, "evaluation_episodes")
 
 Experiments = Mapping[Path, Experiment]
@@ -32,8 +35,10 @@ def pooled_table(
     """Return the table of any runs, grouped into conditions by some fields of their experiments.
 
     Runs with the same values of these fields form one condition, and their replicas are pooled. Replicas are
-    numbered by the seeds of their runs, so that replicas with the same number have the same seed. They are
-    paired if all conditions have the same seeds.
+    numbered by the seeds of their runs, so that replicas with the same number have the same seed; groups of
+    people by their session, whose rounds in a condition are episodes of the same group. They are paired if
+    all conditions have the same seeds, or sessions. People and trained agents are never pooled: where some
+    runs are of people and some not, their agents are a field too.
 
     Args:
         runs: directories of runs, or of directories that hold them; results that `cprl export` made too.
@@ -46,23 +51,27 @@ def pooled_table(
             raise refusal("by", path, "other fields than seed and replicas, each once")
     paths = runs_in(runs)
     experiments = {run: Experiment.from_recipe(read_recipe(run), directory=run) for run in paths}
+    kinds = {has_people(experiment.agents) for experiment in experiments.values()}
+    if len(kinds) > 1 and _AGENTS not in fields:
+        fields.append(_AGENTS)
     conditions, groups = _groups(experiments, fields)
     for name, members in groups.items():
         _refuse_seeds_twice(name, members)
     if reference is not None and reference not in groups:
         raise refusal("reference", reference, f"the name of a condition: {', '.join(list(groups)[:10])}")
-    firsts = _firsts(experiments.values())
+    origins = {run: _origin(run, experiment) for run, experiment in experiments.items()}
+    firsts = _firsts(experiments, origins)
     sources = []
-    seeds = set()
+    paired = set()
     for name, members in groups.items():
-        seeds.add(frozenset(experiment.seed for experiment in members.values()))
+        paired.add(frozenset(origins[run] for run in members))
         for run, experiment in members.items():
             source = RunSource(
                 run=run,
                 name=str(run),
                 condition=name,
                 checksum=Condition(experiment).checksum_in(run.parent),
-                first=firsts[experiment.seed],
+                first=firsts[origins[run]],
                 experiment=experiment,
                 reason=reason_missing(state_of(run)),
             )
@@ -71,8 +80,8 @@ def pooled_table(
         name=f"{len(paths)} runs by {', '.join(fields)}",
         conditions=conditions,
         reference=next(iter(groups)) if reference is None else reference,
-        is_paired=len(seeds) == 1,
-        notes=tuple(_notes(groups, fields)),
+        is_paired=len(paired) == 1,
+        notes=(*_notes(groups, fields), *_absences(experiments)),
         clocks=clocks_of({name: members.values() for name, members in groups.items()}),
     )
     return table_of_sources(design, sources, window=window)
@@ -92,6 +101,9 @@ def _groups(
     groups: dict[str, Any] = {}
     for values, members in sorted(by_values.values(), key=lambda group: list(map(_rank, group[0]))):
         levels = {path: plain_level(value) for path, value in zip(fields, values, strict=True)}
+        if _AGENTS in levels:
+            one: Any = next(iter(members.values()))
+            levels[_AGENTS] = learned(specs_by_agent(one.agents, one.game.agents))
         name = unique_name(condition_name({short[path]: level for path, level in levels.items()}), groups)
         conditions[name] = levels
         groups[name] = members
@@ -113,7 +125,7 @@ def _rank(value: Any) -> tuple[int, float]:
 def _refuse_seeds_twice(name: str, experiments: Experiments) -> None:
     """Refuse runs of one condition with the same seed, which would count replicas twice."""
     for (one, first), (other, second) in combinations(experiments.items(), 2):
-        if first.seed == second.seed:
+        if first.seed == second.seed and not has_people(first.agents):
             places = _places(first, second)
             why = "they are the same experiment"
             if places:
@@ -124,12 +136,21 @@ def _refuse_seeds_twice(name: str, experiments: Experiments) -> None:
             )
 
 
-def _firsts(experiments: Iterable[Experiment]) -> dict[int, int]:
-    most: dict[int, int] = {}
-    for experiment in experiments:
-        most[experiment.seed] = max(most.get(experiment.seed, 0), experiment.replicas)
-    seeds = sorted(most)
-    return dict(zip(seeds, accumulate((most[seed] for seed in seeds), initial=0), strict=False))
+def _origin(run: Path, experiment: Experiment) -> tuple[int, str]:
+    """Return what runs share whose replicas of the same number belong together: the seed, or of people the
+    session."""
+    if not has_people(experiment.agents):
+        return experiment.seed, ""
+    return 0, str(read_recipe(run).get(SESSION, run.resolve()))
+
+
+def _firsts(experiments: Experiments, origins: Mapping[Path, Any]) -> dict[Any, int]:
+    """Return the number of the first replica of each origin."""
+    most: dict[Any, int] = {}
+    for run, experiment in experiments.items():
+        most[origins[run]] = max(most.get(origins[run], 0), experiment.replicas)
+    in_order = sorted(most)
+    return dict(zip(in_order, accumulate((most[origin] for origin in in_order), initial=0), strict=False))
 
 
 def _notes(groups: Mapping[str, Experiments], fields: Sequence[str]) -> Iterator[str]:
@@ -145,6 +166,14 @@ def _notes(groups: Mapping[str, Experiments], fields: Sequence[str]) -> Iterator
     places = sorted(place for place in more if not _is_within(place, fields))
     if places:
         yield f"The conditions also differ in {abbreviated(places, _MOST_NAMED)}."
+
+
+def _absences(experiments: Experiments) -> Iterator[str]:
+    """Yield a sentence for each run in which nobody was there to act for an agent of a person."""
+    for run, experiment in experiments.items():
+        sentence = absence(run) if has_people(experiment.agents) else ""
+        if sentence:
+            yield f"{run}: {sentence}"
 
 
 def _places(one: Experiment, other: Experiment) -> list[str]:

@@ -17,7 +17,7 @@ from cprl.measuring.outcome import RULE, outcome_of
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, INSTITUTIONS, METRICS, TOTALS
 from cprl.measuring.table import ROW_ORDER, WINDOWS, by_replica, complete, stored_metrics, where, world_of
 from cprl.measuring.windows import episodes_after, episodes_per_world
-from cprl.population import any_learns
+from cprl.population import any_learns, has_people
 from cprl.runs.episodes import read_episodes, read_rows
 from cprl.runs.files import REPORT, read_json
 from cprl.runs.recipe import read_recipe, recipe_parts
@@ -26,6 +26,7 @@ from cprl.studies.study import Study, level_text, unique_name
 from cprl.studies.tables.tidy_table import (
     CIRCUMSTANCES,
     DAMAGED,
+    EVALUATION_PART,
     RANDOM_PART,
     RUN_PARTS,
     TABLE_COLUMNS,
@@ -214,9 +215,13 @@ def _lengths(rows: pa.Table, steps: Mapping[str, list[int]]) -> dict[str, dict[s
 
 
 def _tables_of(source: RunSource) -> dict[str, pa.Table]:
-    """Read the episode tables of the parts of a run, sorted, with a row for each agent."""
+    """Read the episode tables of the parts of a run, sorted, with a row for each agent. What people played
+    stands for their training and for their evaluation; nobody plays at random in its worlds."""
     tables = {}
-    for part, name in RUN_PARTS.items():
+    parts: dict[str, str | None] = dict(RUN_PARTS)
+    if has_people(source.experiment.agents):
+        parts = dict.fromkeys((TRAINING_PART, EVALUATION_PART))
+    for part, name in parts.items():
         folder = source.run / "evaluation"
         table = read_episodes(source.run) if name is None else read_rows(folder / f"{name}.parquet")
         table = table.sort_by(ROW_ORDER)
@@ -261,7 +266,9 @@ def _steps_of(run: Path) -> list[int]:
 
 
 def _outcome_words(tables: Mapping[str, pa.Table]) -> list[str]:
-    """Return a word for the outcome of each replica's training, e.g. "tragedy"."""
+    """Return a word for the outcome of each replica's training, e.g. "tragedy"; none for people."""
+    if RANDOM_PART not in tables:
+        return []
     training = tables[TRAINING_PART]
     random = tables[RANDOM_PART]
     number = COLLECTIVE_RETURN if COLLECTIVE_RETURN in random.column_names else INCOME

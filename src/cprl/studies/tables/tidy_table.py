@@ -179,6 +179,11 @@ class StudyTable:
         return tuple(self.rows["metric"].unique().to_pylist()) if len(self.rows) else ()
 
     @cached_property
+    def hosted_conditions(self) -> tuple[str, ...]:
+        """Return the conditions that people played, whose groups end in no phase of a training."""
+        return tuple(name for name, ended in self.endings.items() if not ended)
+
+    @cached_property
     def replicas(self) -> Mapping[str, int]:
         """Return the number of replicas in the table, by condition."""
         pairs = self.rows.select(["condition", "replica"]).group_by(["condition", "replica"]).aggregate([])

@@ -5,7 +5,6 @@ import re
 import zlib
 from base64 import b64decode
 from dataclasses import replace
-from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -15,11 +14,11 @@ from viewers import browser, wait_until
 from cprl import Custom, keys, presets
 from cprl.commons.cells import BEAM
 from cprl.evaluation.fresh import fresh_episodes, record
-from cprl.evaluation.show import show
 from cprl.institutions import Boundaries, Monitoring, Punishment, Quota, Tax
 from cprl.measuring.registry import SOCIAL_METRICS
 from cprl.pictures.readable import growth_of, legend_of, meaning_of
 from cprl.values import trust
+from cprl.web.show import show
 
 COMMONS = presets.game("commons")
 GOVERNED = replace(
@@ -43,20 +42,12 @@ def runs(tmp_path_factory):
 
 
 def told(path):
-    """What a page is told, its arrays unpacked."""
+    """What a page is told, its turns unpacked."""
     text = path.read_text(encoding="utf-8")
     data = json.loads(re.search(r'<script id="data" type="application/json">(.*?)</script>', text)[1])
     for population in data["populations"]:
-        raw = zlib.decompress(b64decode(population["data"]))
-        for name, kind, length in population["arrays"]:
-            values = np.frombuffer(raw, f"<{kind}", length)
-            raw = raw[values.nbytes :]
-            population[name] = (
-                values.reshape(population["turns"] + (name == "beam_first"), -1)
-                if (name != "beams")
-                else values
-            )
-        assert raw == b""
+        population |= json.loads(zlib.decompress(b64decode(population["data"])))
+        population["boards"] = [moment["board"] for moment in population["moments"]]
     return data
 
 
@@ -68,24 +59,26 @@ def test_a_page_holds_the_episode_that_a_film_shows(runs, tmp_path):
     greedy, governed = data["populations"]
     filmed = record(*fresh_episodes([runs / "governed"], episode=1))
     cells = [moment.row * governed["width"] + moment.col for moment in filmed.boards]
-    assert governed["cell"].tolist() == [row.tolist() for row in cells]
-    assert governed["harvested"].tolist() == [moment.harvested.tolist() for moment in filmed.boards]
-    stock = np.unpackbits(governed["stock"], axis=1)[:, : len(governed["sites"])]
+    assert [board["cells"] for board in governed["boards"]] == [row.tolist() for row in cells]
+    harvested = [moment["harvest"] for moment in governed["moments"]]
+    assert harvested == [moment.harvested.tolist() for moment in filmed.boards]
+    apples = np.array([list(bytes.fromhex(board["apples"])) for board in governed["boards"]], np.uint8)
+    stock = np.unpackbits(apples, axis=1)[:, : len(governed["sites"])]
     assert stock.tolist() == [moment.stock.tolist() for moment in filmed.boards]
-    assert governed["stocked"][:, 0].tolist() == stock.sum(1).tolist()
-    violators = [set(np.flatnonzero(row & 8).tolist()) for row in governed["pose"]]
+    assert [moment["stock"] for moment in governed["moments"]] == stock.sum(1).tolist()
+    poses = np.array([board["poses"] for board in governed["boards"]])
+    violators = [set(np.flatnonzero(row & 8).tolist()) for row in poses]
     broke = filmed.entry("next", *keys.VIOLATED)
     assert violators == [set(), *(set(np.flatnonzero(row).tolist()) for row in broke)]
     assert any(violators)
-    assert (governed["pose"] & 3).tolist() == [moment.heading.tolist() for moment in filmed.boards]
-    assert (governed["pose"] & 4 > 0).tolist() == [moment.in_play.tolist() for moment in filmed.boards]
-    ends = governed["beam_first"][:, 0]
-    lit = [set(governed["beams"][first:last].tolist()) for first, last in pairwise(ends)]
+    assert (poses & 3).tolist() == [moment.heading.tolist() for moment in filmed.boards]
+    assert (poses & 4 > 0).tolist() == [moment.in_play.tolist() for moment in filmed.boards]
+    lit = [set(board["beams"]) for board in governed["boards"]]
     assert lit == [set(np.flatnonzero(moment.board.reshape(-1) == BEAM).tolist()) for moment in filmed.boards]
     assert any(lit)
-    assert governed["fined"][-1, 0] == pytest.approx(second.fines.sum(), rel=1e-6)
+    assert governed["fined"][-1] == pytest.approx(second.fines.sum(), abs=1e-3)
     assert second.fines.sum() > 0
-    assert governed["equality"][-1, 0] == pytest.approx(second.metrics["equality"], abs=1e-6)
+    assert governed["equality"][-1] == pytest.approx(second.metrics["equality"], abs=1e-3)
     assert "equality" in SOCIAL_METRICS
     assert len(governed["regions"]) == 4
     assert "fined" not in greedy

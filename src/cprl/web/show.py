@@ -1,56 +1,36 @@
 """Shows episodes of stored agents side by side on one HTML page, which opens from the disk without a network.
 
-This module collects the data; `show.html`, beside it, is the page that draws them.
+This module collects the data; `static/show.js` is what draws them.
 """
 
-import json
-import re
 import zlib
 from base64 import b64encode
 from collections.abc import Sequence
 from html import escape
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from cprl import keys
-from cprl.commons.cells import APPLE, BEAM, CLEANING, WALL, WASTE, WATER
 from cprl.commons.game import Game
-from cprl.commons.maps import Map
-from cprl.envs.unwrap import commons_of
 from cprl.evaluation.film import check_titles, titles_of
 from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episodes, print_descriptions, record
 from cprl.evaluation.populations import commons_game
 from cprl.measuring.social import equality
 from cprl.measuring.tracker import Episode
-from cprl.pictures.colours import GREY, PALETTE, agent_colour, agent_mark, line_colour
-from cprl.pictures.image import EMPTY_SITE_COLOUR
+from cprl.pictures.colours import line_colour
 from cprl.pictures.readable import NO_RULES, growth_of, legend_of, meaning_of, rules_of
-from cprl.population import learned
+from cprl.population import has_people, learned
 from cprl.runs.files import refuse_to_write_over, write_text
 from cprl.system.working import working
 from cprl.training.stored import LoadedRun
 from cprl.values import refusal
-from cprl.viewer.pictures import regions_of
+from cprl.web.scenes import compact_json, moment_json, scene_json
+from cprl.web.static_pages import page_of
 
 _MOST_RUNS: Final = 6
 """The largest number of runs on a page."""
-_COLOURS: Final = {
-    "wall": PALETTE[WALL],
-    "apple": PALETTE[APPLE],
-    "beam": PALETTE[BEAM],
-    "water": PALETTE[WATER],
-    "waste": PALETTE[WASTE],
-    "cleaning": PALETTE[CLEANING],
-    "empty": EMPTY_SITE_COLOUR,
-}
-_IN_PLAY: Final = 4
-"""The bit of an agent's pose that says that it is in play. The two lowest bits are its heading, 0 to 3."""
-_VIOLATED: Final = 8
-"""The bit of an agent's pose that says that it broke a rule in the turn."""
 
 
 @working("making a page")
@@ -141,9 +121,7 @@ class Page(type(Path())):  # type: ignore[misc]
         return f'<iframe srcdoc="{text}" style="width:100%;height:{self.HEIGHT}px;border:0"></iframe>'
 
 
-def page(
-    title: str, before: str, data: dict[str, Any] | None = None, after: str = "", *, live: str = ""
-) -> str:
+def page(title: str, before: str, data: dict[str, Any] | None = None, after: str = "") -> str:
     """Return the text of a page.
 
     Args:
@@ -151,24 +129,21 @@ def page(
         before: HTML above the episode.
         data: the episode, as `data_of` returns it; None for a page without an episode.
         after: HTML below the episode.
-        live: JavaScript that runs after that of the page.
     """
-    template = files("cprl.evaluation").joinpath("show.html").read_text(encoding="utf-8")
-    encoded = json.dumps(data or {"populations": []}, separators=(",", ":")).replace("<", "\\u003c")
-    parts = {"title": escape(title), "before": before, "after": after, "data": encoded, "live": live}
-    return re.sub(r"\$(title|before|after|data|live)\b", lambda name: parts[name[1]], template)
+    encoded = compact_json(data or {"populations": []}).replace("<", "\\u003c")
+    parts = {"title": escape(title), "before": before, "after": after, "data": encoded}
+    return page_of("show.html", "board.js", "show.js", **parts)
 
 
 def data_of(
     fresh: Sequence[FreshEpisode], titles: Sequence[str] = ()
 ) -> tuple[dict[str, Any], tuple[Episode, ...]]:
-    """Play the episodes; return the data that `show.html` draws, and the episodes."""
+    """Play the episodes; return the data that `show.js` draws, and the episodes."""
     games = [commons_game(population.run) for population in fresh]
     recorded = [record(population) for population in fresh]
     populations = zip(titles or titles_of(fresh), fresh, recorded, strict=True)
     return {
         "populations": [_population(*population) for population in populations],
-        "palette": _COLOURS,
         "axis": max(played.last for played in recorded),
         "most": max(int(played.boards[-1].harvested.max()) for played in recorded),
         "legend": legend_of(games),
@@ -176,28 +151,33 @@ def data_of(
 
 
 def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, Any]:
-    """Return the data about one run's agents, in the form that `show.html` reads."""
+    """Return the data about one run's agents, in the form that `show.js` reads.
+
+    `data` is what changes from turn to turn: JSON, compressed by zlib and encoded in base64.
+    """
     game = commons_game(fresh.run)
-    board = game.map
-    agents = range(game.agents)
-    commons = commons_of(fresh.env)
-    assert commons is not None
-    arrays = _turns(board, played)
+    violated = played.since_the_start("next", *keys.VIOLATED) > 0
+    moments = [
+        {
+            "harvest": world.harvested.tolist(),
+            "stock": int(world.stock.sum()),
+            "board": moment_json(game.map, world, broken),
+        }
+        for world, broken in zip(played.boards, violated, strict=True)
+    ]
+    shares = equality(np.stack([world.harvested for world in played.boards]))
+    changing = {
+        "moments": moments,
+        "equality": [None if np.isnan(share) else round(float(share), 3) for share in shares],
+    }
     counted = ["apples on the board", "picked by all", "how evenly shared (1: all alike)"]
     fines = played.since_the_start("next", *keys.FINES).sum(1).cumsum()
     if fines.any() or any(institution.can_be_broken for institution in game.institutions):
-        arrays["fined"] = fines.astype(np.float32)
+        changing["fined"] = fines.round(3).tolist()
         counted.append("apples paid as fines")
     outcome = f"apples still grow after {played.last:,} turns"
     if played.is_dead:
         outcome = f"gone for good at turn {played.last:,}: no apple is left"
-    regions = [
-        {
-            "colour": agent_colour(owners[0]) if len(owners) == 1 else GREY,
-            "cells": np.flatnonzero(inside).tolist(),
-        }
-        for owners, inside in regions_of(commons)
-    ]
     return {
         "title": title,
         "which": fresh.description,
@@ -205,18 +185,9 @@ def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, 
         "outcome": outcome,
         "isDead": played.is_dead,
         "counted": counted,
-        "turns": played.last + 1,
-        "agents": game.agents,
-        "width": board.width,
-        "height": board.height,
-        "walls": _cells(board, board.walls),
-        "river": _cells(board, board.river),
-        "sites": _cells(board, board.sites),
-        "regions": regions,
-        "colours": [agent_colour(agent) for agent in agents],
-        "lines": [line_colour(agent) for agent in agents],
-        "marks": [agent_mark(agent) for agent in agents],
-        **_packed(arrays),
+        "lines": [line_colour(agent) for agent in range(game.agents)],
+        **scene_json(game),
+        "data": b64encode(zlib.compress(compact_json(changing).encode(), 9)).decode("ascii"),
     }
 
 
@@ -228,57 +199,11 @@ def about(run: LoadedRun) -> str:
     if run.networks:
         sentences = [f"Computer players that learned by practice: {agents}, {experiment.trained_for}."]
     else:
-        sentences = [f"Computer players: {agents}."]
+        players = "Players" if has_people(run.specs) else "Computer players"
+        sentences = [f"{players}: {agents}."]
     sentences += [meaning_of(kind, game) for kind in game.institutions]
     if game.institutions:
         sentences.append(f"Settings: {rules_of(game)}.")
     elif not experiment.custom_rules:
         sentences.append(f"Rules: {NO_RULES}.")
     return " ".join([*sentences, experiment.custom_code]).strip()
-
-
-def _cells(board: Map, positions: Sequence[Sequence[int]]) -> list[int]:
-    """Return the indices of cells, counted row by row, from positions that begin with (row, col)."""
-    return [row * board.width + col for row, col, *_ in positions]
-
-
-def _turns(board: Map, played: Recorded) -> dict[str, NDArray[Any]]:
-    """Return the data that change from turn to turn as arrays [turns, ...]; bits are packed into bytes.
-
-    `beams` has the indices of the cells that a beam lights, of all turns one after the other. Those of turn t
-    are `beams[beam_first[t] : beam_first[t + 1]]`. To the index of a cell that is being cleaned the number of
-    cells of the board is added.
-    """
-
-    def stacked(name: str) -> NDArray[Any]:
-        return np.stack([getattr(board_in_turn, name) for board_in_turn in played.boards])
-
-    harvested = stacked("harvested")
-    stock = stacked("stock")
-    boards = stacked("board").reshape(len(stock), -1)
-    is_violated = played.since_the_start("next", *keys.VIOLATED) > 0
-    pose = stacked("heading") + _IN_PLAY * stacked("in_play") + _VIOLATED * is_violated
-    turns, lit = np.nonzero(np.concatenate([boards == BEAM, boards == CLEANING], 1))
-    return {
-        "stock": np.packbits(stock, axis=1),
-        "waste": np.packbits(boards[:, _cells(board, board.river)] == WASTE, axis=1),
-        "stocked": stock.sum(1, dtype=np.uint32),
-        "cell": (stacked("row") * board.width + stacked("col")).astype(np.uint32),
-        "pose": pose.astype(np.uint8),
-        "harvested": harvested.astype(np.uint32),
-        "equality": equality(harvested).astype(np.float32),
-        "beam_first": np.searchsorted(turns, np.arange(len(stock) + 1)).astype(np.uint32),
-        "beams": lit.astype(np.uint32),
-    }
-
-
-def _packed(arrays: dict[str, NDArray[Any]]) -> dict[str, Any]:
-    """Return arrays joined and compressed for JSON, with the name, the type and the length of each.
-
-    The bytes are little-endian, compressed by zlib and encoded in base64.
-    """
-    raw = b"".join(values.astype(values.dtype.newbyteorder("<")).tobytes() for values in arrays.values())
-    lengths = [
-        (name, f"{values.dtype.kind}{values.itemsize}", values.size) for name, values in arrays.items()
-    ]
-    return {"arrays": lengths, "data": b64encode(zlib.compress(raw, 9)).decode("ascii")}

@@ -1,0 +1,417 @@
+"""HostedRound: the worlds of all groups of people under one treatment, turn by turn, and what is kept of
+them.
+
+Each turn is appended to a journal before anybody sees it, so that a process that is killed loses no finished
+turn. The actions are all that a restart needs: the worlds, the other agents and all chance follow from the
+seed, and `HostedRound.begin` plays them again.
+"""
+
+from base64 import b64encode
+from collections.abc import Mapping, Sequence
+from io import FileIO
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+import torch
+from pyarrow.csv import write_csv
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from cprl import keys
+from cprl.commons.game import Game
+from cprl.commons.world import WorldView
+from cprl.envs.commons_env import CommonsEnv
+from cprl.evaluation.fresh import averages_of
+from cprl.experiment import Experiment
+from cprl.measuring.playing import evaluate
+from cprl.measuring.tracker import Episode, tracker_of
+from cprl.pictures.decoding import classes_seen
+from cprl.population import AgentSpec, Person, Scripted, has_people, partners_in
+from cprl.runs.episodes import append_batch, batches_in, stored_episodes
+from cprl.runs.files import REPORT, write_atomically
+from cprl.runs.played import write_played
+from cprl.runs.states import start
+from cprl.training.agents import Population
+from cprl.training.stored import LoadedRun
+from cprl.values.array_types import Bool, Int64, UInt8
+from cprl.web.hosting import TRAINED
+from cprl.web.messages import SIGNS
+from cprl.web.scenes import moment_json, scene_json, window_colours
+from cprl.web.session import HostedSession, instructions_of, options_of
+
+NONE: Final = -1
+"""What stands for no action, or no vote: a script, or chance, decides."""
+_COLUMNS: Final = {
+    "turn": pa.int32(),
+    "ms": pa.int64(),
+    "group": pa.int16(),
+    "agent": pa.int16(),
+    "person": pa.bool_(),
+    "given": pa.bool_(),
+    "action": pa.int16(),
+    "cell": pa.int32(),
+    "heading": pa.int8(),
+    "in_play": pa.bool_(),
+    "harvest": pa.float32(),
+    "reward": pa.float32(),
+    "fired": pa.bool_(),
+    "tagged": pa.bool_(),
+    "stock": pa.int32(),
+    "decision": pa.int32(),
+    keys.VIOLATED[-1]: pa.bool_(),
+    keys.FINES[-1]: pa.float32(),
+}
+TURN_COLUMNS: Final = pa.schema(_COLUMNS)
+"""The columns of turns.parquet, a row for each turn, group and agent; docs/people.md describes them.
+
+"ms" counts since 1970; "person": a person acts, also by doing nothing, and no script for who has left;
+"given": the person chose the action; "cell", "heading" and "in_play" are those after the turn; "decision" is
+-1 without ballots."""
+CHAT_COLUMNS: Final = pa.schema(
+    {**{name: _COLUMNS[name] for name in ("turn", "ms", "group", "agent")}, "text": pa.string()}
+)
+"""The columns of chat.parquet; "turn" is the one that was played last."""
+
+
+class Journal:
+    """Rows as an Arrow stream, unbuffered: what `add` wrote survives SIGKILL.
+
+    Args:
+        path: the file; an earlier one is read, and continued after its last whole batch.
+        schema: the columns.
+    """
+
+    def __init__(self, path: Path, schema: pa.Schema) -> None:
+        self.path = path
+        self.schema = schema
+        self.batches: list[pa.RecordBatch] = []
+        end = 0
+        if path.exists():
+            whole = list(batches_in(path))
+            self.batches = [batch for batch, _ in whole]
+            end = whole[-1][1] if whole else 0
+        self._file = FileIO(path, "r+" if path.exists() else "x")
+        self._file.truncate(end)
+        self._file.seek(end)
+
+    def add(self, columns: Mapping[str, Any]) -> None:
+        """Append rows: an array or a list for each column."""
+        arrays = [pa.array(columns[field.name], field.type) for field in self.schema]
+        batch = pa.record_batch(arrays, schema=self.schema)
+        append_batch(self._file, batch, is_first=not self.batches)
+        self.batches.append(batch)
+
+    def table(self) -> pa.Table:
+        """Return all rows."""
+        return pa.Table.from_batches(self.batches, self.schema)
+
+    def close(self) -> None:
+        """Close the file, which can be continued later."""
+        self._file.close()
+
+
+class HostedRound:
+    """A round of a session, or a practice round. Making it checks and warms up all that it needs.
+
+    Args:
+        session: the session.
+        number: the index of its treatment.
+        name: the name of the treatment.
+        game: its game, see `HostedSession.games`.
+        runs: the runs whose agents may play as "trained".
+        folder: the run's directory, which `begin` makes; None for a practice round.
+
+    Raises:
+        ValueError: if no run has agents that can play the game.
+    """
+
+    def __init__(
+        self,
+        session: HostedSession,
+        number: int,
+        name: str,
+        game: Game,
+        *,
+        runs: Sequence[LoadedRun] = (),
+        folder: Path | None = None,
+    ) -> None:
+        self.session = session
+        self.number = number
+        self.name = name
+        self.game = game
+        self.folder = folder
+        self.seed = session.seed + number
+        self._runs = runs
+        self._journals: list[Journal] = []
+        self.episodes: dict[int, Episode] = {}
+        """The episode of each group that has ended."""
+        self._find_agents()
+        greedy = [Scripted("greedy")] * game.agents
+        env = CommonsEnv(game, seed=self.seed)
+        (episode,) = evaluate(env, Population(env, greedy, seed=self.seed).policy(1))
+        self.greedy_turns = episode.steps if episode.terminated else None
+        """The turns after which the board is empty if all are greedy; None if it is not."""
+        self.play(self.nothing(), self.nothing())
+        self.views()
+        self._set_up()
+        if self.is_finished and folder is not None:
+            self.episodes = {episode.replica: episode for episode in stored_episodes(folder)}
+
+    def _find_agents(self) -> None:
+        """Find agents that can play, those of a run where some are to be trained."""
+        runs: Sequence[LoadedRun | None] = self._runs if TRAINED in self.session.agents else [None]
+        refused: ValueError | None = None
+        for run in runs:
+            self._specs = self.session.specs(run)
+            try:
+                self._set_up()
+                return
+            except ValueError as error:
+                refused = error
+        raise ValueError(f"round {self.name!r}: {refused}") from refused
+
+    def _set_up(self) -> None:
+        """Put worlds, agents and totals at their beginning."""
+        self._env = CommonsEnv(self.game, self.session.groups, seed=self.seed)
+        self._policy = Population(self._env, self._specs, seed=self.seed).policy(1)
+        self._tracker = tracker_of(self._env)
+        self._moment = self._env.reset()
+        self._violated = self.nothing() != NONE
+        self._income = np.zeros(self._violated.shape)
+        self.turn = 0
+        self.episodes.clear()
+
+    @property
+    def is_over(self) -> bool:
+        """Return whether the episode of each group has ended."""
+        return len(self.episodes) == self.session.groups
+
+    @property
+    def is_finished(self) -> bool:
+        """Return whether the run is written."""
+        return self.folder is not None and (self.folder / REPORT).exists()
+
+    @property
+    def has_chat(self) -> bool:
+        """Return whether people may write to their group."""
+        return self.session.chat or self.game.rules.signals > 0
+
+    def begin(self, session_id: str) -> None:
+        """Make the run's directory, or play the turns again that an earlier process has kept.
+
+        Args:
+            session_id: what all rounds of the session have in common, see `cprl.runs.states.start`.
+
+        Raises:
+            ValueError: if the turns are not those that were kept.
+        """
+        if self.folder is None:
+            return
+        if not self.folder.exists():
+            people: list[AgentSpec] = [Person()] * self.session.people
+            experiment = Experiment(
+                name=f"round-{self.number + 1}",
+                game=self.game,
+                agents=(*people, *self._specs[self.session.people :]),
+                episodes=1,
+                replicas=self.session.groups,
+                seed=self.seed,
+            )
+            start(self.folder, experiment, partners_in(self._specs), session=session_id)
+        self._journals = [
+            Journal(self.folder / "turns.arrows", TURN_COLUMNS),
+            Journal(self.folder / "chat.arrows", CHAT_COLUMNS),
+        ]
+        for batch in self._journals[0].batches:
+            self._play_again(batch)
+
+    def _play_again(self, batch: pa.RecordBatch) -> None:
+        agents = batch["group"].to_numpy(), batch["agent"].to_numpy()
+        action = self.nothing()
+        action[agents] = batch["action"]
+        decision = self.nothing()
+        decision[agents] = batch["decision"]
+        self.play(action, decision)
+        if not np.array_equal(self._cells()[agents], batch["cell"]):
+            raise ValueError(
+                f"{self.folder} cannot be continued: turn {self.turn}, played again, is another one; "
+                "was it begun with another version of cprl?"
+            )
+
+    def nothing(self) -> Int64:
+        """Return actions, or decisions, of G groups of N agents of which none is given: int64 [G, N],
+        NONE."""
+        return np.full((self.session.groups, self.game.agents), NONE)
+
+    def play(self, action: Int64, decision: Int64) -> None:
+        """Play a turn of all groups.
+
+        Args:
+            action: int64 [G, N], the actions that are given; scripts and trained agents take the others.
+            decision: int64 [G, N], decisions that are given, see `Game.decisions`; the others fall by chance.
+        """
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            acted = self._policy(self._moment)
+            for key, given in ((keys.ACTION, action), (keys.DECISION, decision)):
+                if key in acted.keys(True):
+                    np.copyto(acted[key].numpy(), given, where=given != NONE)
+            self._batch, self._moment = self._env.lean_step(acted, resets=False)
+        self.turn += 1
+        self._income += self._batch["next", keys.AGENTS, "reward"][..., 0].numpy()
+        if self.game.institutions:
+            self._violated = self._batch["next", keys.VIOLATED].numpy()
+        for episode in self._tracker.add(self._batch):
+            self.episodes.setdefault(episode.world, episode)
+
+    def keep(self, groups: Sequence[int], person: Bool, given: Bool, ms: int) -> None:
+        """Append the turn of some groups to the journal.
+
+        Args:
+            groups: those whose episodes had not ended before the turn.
+            person: bool [G, N], whether a person acts, see `TURN_COLUMNS`.
+            given: bool [G, N], whether the person chose the action.
+            ms: the time, milliseconds since 1970.
+        """
+        if self.folder is None:
+            return
+        agents = self._batch["next", keys.AGENTS]
+        now = self._env.worlds.now
+        values = {
+            "turn": self.turn,
+            "ms": ms,
+            "group": np.arange(self.session.groups)[:, None],
+            "agent": np.arange(self.game.agents),
+            "person": person,
+            "given": given,
+            "action": self._batch[keys.ACTION].numpy(),
+            "cell": self._cells(),
+            "heading": now.heading,
+            "reward": agents["reward"][..., 0].numpy(),
+            "tagged": agents["tagged_by"].numpy().any(-1),
+            "stock": now.stock_left,
+            "decision": self._batch[keys.DECISION].numpy() if self.game.decisions else NONE,
+            keys.VIOLATED[-1]: self._violated,
+        }
+        for _, name in (keys.IN_PLAY, keys.HARVEST, keys.FIRED, keys.FINES):
+            values[name] = agents.get(name, torch.zeros(())).numpy()
+        self._journals[0].add(
+            {name: np.broadcast_to(array, person.shape)[groups].ravel() for name, array in values.items()}
+        )
+
+    def _cells(self) -> Int64:
+        now = self._env.worlds.now
+        cells: Int64 = now.row * self.game.map.width + now.col
+        return cells
+
+    def keep_chat(self, group: int, agent: int, text: str, ms: int) -> None:
+        """Append a line of chat to the journal."""
+        if self.folder is not None:
+            row = {"turn": self.turn, "ms": ms, "group": group, "agent": agent, "text": text}
+            self._journals[1].add({name: [value] for name, value in row.items()})
+
+    def finish(self) -> None:
+        """Write the run: its episodes, turns.parquet, turns.csv and chat.parquet."""
+        if self.folder is None:
+            return
+        turns, chat = (journal.table() for journal in self._journals)
+        write_atomically(self.folder / "turns.csv", lambda file: write_csv(turns, file))
+        write_played(self.folder, [*self.episodes.values()], turns=turns, chat=chat)
+        self.close()
+        for journal in self._journals:
+            journal.path.unlink()
+
+    def close(self) -> None:
+        """Close the journals, which a later process can continue."""
+        for journal in self._journals:
+            journal.close()
+
+    # what people see
+
+    def fixed(self) -> dict[str, Any]:
+        """Return the parts of the message "round" that all people share."""
+        game = self.game
+        return {
+            "rule": self.name,
+            "instructions": instructions_of(game, self.session.view),
+            "view": self.session.view,
+            "turns_a_second": self.session.turns_a_second or None,
+            "episode_steps": game.rules.episode_steps,
+            "actions": game.actions,
+            "options": options_of(game),
+            "chat": self.has_chat,
+            "observation_shape": game.observation_shape,
+            "window_rows": game.observation_shape[1],
+            "window_columns": game.observation_shape[2],
+            "window_colours": window_colours(game),
+            **scene_json(game),
+        }
+
+    def views(self) -> list[dict[str, Any]]:
+        """Return the parts of the message "turn" that the people of each group share."""
+        boards = self._env.worlds.boards(self._env.output)
+        now = self._env.worlds.now
+        views = []
+        for group, board in enumerate(boards):
+            arrays = {name: getattr(now, name)[group] for name in WorldView._fields[2:]}
+            world = WorldView(self._observation()[group], board, **arrays)
+            views.append(
+                {
+                    "turn": self.turn,
+                    "harvest": world.harvested.tolist(),
+                    "income": self._income[group].round(2).tolist() if self.game.institutions else None,
+                    "stock": int(now.stock_left[group, 0]),
+                    "rule_in_force": "; ".join(self.in_force(group)) or None,
+                    "board": moment_json(self.game.map, world, self._violated[group]),
+                }
+            )
+        return views
+
+    def in_force(self, group: int) -> list[str]:
+        """Return the title and the value in force of each ballot, after the first turn."""
+        values = self._moment[keys.IN_FORCE][group].tolist() if self.game.ballots and self.turn else []
+        return [
+            f"{ballot.title}: {value:g}" for ballot, value in zip(self.game.ballots, values, strict=False)
+        ]
+
+    def in_play(self) -> Bool:
+        """Return which agents can act in the coming turn, bool [G, N]."""
+        in_play: Bool = self._moment[keys.IN_PLAY].numpy().copy()
+        in_play[[*self.episodes]] = False
+        return in_play
+
+    def _observation(self) -> UInt8:
+        observation: UInt8 = self._moment[keys.OBSERVATION].numpy()
+        return observation
+
+    def seen(self, group: int, agent: int, view: str) -> dict[str, str]:
+        """Return what an agent observes, in the form that its seat asks for: "window", "array" or "text"."""
+        observation = self._observation()[group, agent]
+        if view == "array":
+            return {"observation": b64encode(observation.tobytes()).decode()}
+        classes = classes_seen(self.game, observation[None, None])[0, 0]
+        if view == "window":
+            return {"window": b64encode(classes.tobytes()).decode()}
+        signs = np.vectorize(lambda kind: SIGNS.get(kind, "O"))(classes)
+        return {"text": "\n".join(map("".join, signs))}
+
+    def result(self, group: int) -> dict[str, Any]:
+        """Return how the round ended for a group, as messages say it."""
+        episode = self.episodes[group]
+        assert episode.harvest is not None
+        return {
+            "harvest": episode.harvest.astype(int).tolist(),
+            "income": episode.return_.round(2).tolist() if self.game.institutions else None,
+            "survival_steps": episode.steps,
+            "ended": "no apple was left" if episode.terminated else "time was up",
+        }
+
+    def trained(self) -> dict[str, float] | None:
+        """Return the average harvest of an agent, and the turns, of trained agents that played this very
+        game; None without them."""
+        runs = [run for run in self._runs if run.game == self.game and not has_people(run.specs)]
+        averages = averages_of(runs[0]) if runs else {}
+        if not averages:
+            return None
+        turns, apples = np.median([*averages.values()], axis=0).tolist()
+        return {"harvest": apples / self.game.agents, "survival_steps": turns}

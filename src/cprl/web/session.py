@@ -1,0 +1,128 @@
+"""HostedSession: everything that is decided about a hosted game before the first person joins, as a value."""
+
+import os
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import TypeAlias
+
+from cprl.commons import maps
+from cprl.commons.game import Game
+from cprl.evaluation.fresh import typical_replica
+from cprl.evaluation.play import board_named
+from cprl.institutions import Institution
+from cprl.pictures.readable import capitalised, growth_of, meaning_of, tag_of
+from cprl.policies.scripted import SCRIPTED_POLICIES
+from cprl.population import AgentSpec, Frozen, Scripted
+from cprl.training.stored import LoadedRun, load
+from cprl.values import refusal
+from cprl.web.hosting import STAY, TRAINED, Hosting, ShortText
+
+Treatment: TypeAlias = Game | tuple[Institution, ...]
+"""What a round is played by: institutions in place of those of the session's game, or a whole game."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class HostedSession(Hosting, stored=False, called="session"):
+    """A game that people play in groups, in one round or several, under treatments in an order."""
+
+    game: Game | ShortText
+    """The game; or the name of a published board, the directory of a run, or a file with a drawing."""
+    rounds: tuple[tuple[ShortText, Treatment], ...] = ()
+    """The treatment of each round with its name; () for one round of the game as it is."""
+    consent: str | None = field(default=None, repr=False)
+    """The text that people consent to before they play; None for none."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for word in self.agents:
+            if word not in (TRAINED, *SCRIPTED_POLICIES):
+                raise refusal("session.agents", word, ", ".join((TRAINED, *SCRIPTED_POLICIES)))
+        if self.absent not in (STAY, *SCRIPTED_POLICIES):
+            raise refusal("session.absent", self.absent, ", ".join((STAY, *SCRIPTED_POLICIES)))
+
+    def games(self) -> list[tuple[str, Game]]:
+        """Return the name and the game of each round, with a start for each agent.
+
+        Raises:
+            ValueError: for a round that people cannot play; names the round.
+        """
+        game = self.game
+        if isinstance(game, str):
+            game, _ = board_named(game, "published")
+        return [
+            (name, self._game_of(name, game, rules)) for name, rules in self.rounds or (("the game", game),)
+        ]
+
+    def _game_of(self, name: str, base: Game, rules: Treatment) -> Game:
+        """Return the game of a round."""
+        try:
+            game = rules if isinstance(rules, Game) else replace(base, institutions=rules)
+            game = replace(game, map=maps.with_agents(game.map, self.people + len(self.agents)))
+            return with_turns(game, self.turns or game.rules.episode_steps)
+        except ValueError as error:
+            raise ValueError(f"round {name!r}: {error}") from error
+
+    def trained_runs(self) -> list[LoadedRun]:
+        """Return the runs whose agents may play, that of `game` first.
+
+        Raises:
+            ValueError: if agents are to be "trained" and there is no run; for a run with transforms.
+        """
+        runs = [load(path) for path in self.runs]
+        if isinstance(self.game, str):
+            _, run = board_named(self.game, "published")
+            runs = [*([run] if run is not None else []), *runs]
+        for run in runs:
+            if run.experiment.transforms:
+                raise ValueError(f"{run.path} has transforms of its game, in which people cannot play")
+        if TRAINED in self.agents and not runs:
+            raise refusal("session.agents", TRAINED, "with a run, as the game or among the runs")
+        return runs
+
+    def specs(self, run: LoadedRun | None) -> list[AgentSpec]:
+        """Return the specification of each agent as it plays; people stand as what they are when absent.
+
+        Args:
+            run: the run of the agents that are trained; each is the agent of its own index there, or of the
+                index modulo the number of agents.
+        """
+        policies = [self.absent if self.absent != STAY else "random"] * self.people
+        specs: list[AgentSpec] = []
+        for agent, word in enumerate([*policies, *self.agents]):
+            if word == TRAINED and run is not None:
+                path = os.path.relpath(run.path)
+                specs.append(Frozen(path, agent % run.game.agents, replica=typical_replica(run)))
+            else:
+                specs.append(Scripted(word))  # type: ignore[arg-type]
+        return specs
+
+    def names(self) -> list[str]:
+        """Return what the agents of a group are called, e.g. "person 2" and "agent 5 (trained)"."""
+        people = [f"person {agent}" for agent in range(self.people)]
+        others = [f"agent {agent} ({word})" for agent, word in enumerate(self.agents, start=self.people)]
+        return [*people, *others]
+
+
+def with_turns(game: Game, turns: int) -> Game:
+    """Return a game whose episodes have so many turns at most."""
+    return replace(game, rules=replace(game.rules, episode_steps=turns))
+
+
+def instructions_of(game: Game, view: str) -> list[str]:
+    """Return the rules of a game in sentences, for those who play it."""
+    tag = tag_of(game)
+    seen = "the whole board" if view == "board" else "the cells around you, your heading up"
+    sentences = [growth_of(game), f"You see {seen}.", *([f"{capitalised(tag)}."] if tag else [])]
+    sentences += [meaning_of(institution, game) for institution in game.institutions]
+    steps = game.rules.episode_steps
+    return [*sentences, f"A round has {steps:,} turns at most; it ends earlier if no apple is left."]
+
+
+def options_of(game: Game) -> list[str] | None:
+    """Return the decisions of a game in words, in the order of their numbers; None without ballots."""
+    words = []
+    for ballot in game.ballots:
+        elected = "agent " * ballot.is_election
+        words.append([f"{ballot.title}: {elected}{choice:g}" for choice in ballot.choices])
+    # The first ballot changes fastest.
+    return ["; ".join(reversed(choices)) for choices in product(*reversed(words))] if words else None
