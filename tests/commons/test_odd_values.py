@@ -1,6 +1,5 @@
 """What the game, its environments, policies and metrics cannot do as asked is refused by name."""
 
-import time
 from functools import partial
 
 import numpy as np
@@ -65,10 +64,8 @@ def test_a_beam_wider_than_the_board_is_as_wide_as_the_board():
         assert all(map(np.array_equal, one, other))
 
 
-def test_a_large_random_board_takes_less_than_a_second():
-    started = time.process_time()
+def test_a_large_random_board_has_its_sites_and_agents():
     board = maps.random(300, 300, agents=12, density=0.3, clustering=0.8, seed=1)
-    assert time.process_time() - started < 1
     assert (len(board.sites), board.agents) == (27_000, 12)
 
 
