@@ -558,8 +558,8 @@ def metrics_of(env: EnvBase, reported: Collection[str]) -> tuple[str, ...]:
 def decisions_of(env: EnvBase) -> tuple[str, ...]:
     """Return the titles of the decisions in an episode, in the order of "in_force"."""
     commons = commons_of(env)
-    if commons is not None and commons.game.ballots:
-        return tuple(ballot.title for ballot in commons.game.ballots)
+    if commons is not None and commons.game.in_force:
+        return tuple(ballot.title for ballot in commons.game.in_force)
     (width,) = env.observation_spec[keys.IN_FORCE].shape[env.batch_dims :]
     return tuple(f"decision {number}" for number in range(width))
 
