@@ -22,12 +22,14 @@ from cprl.networks.recurrent import state_shape_of
 from cprl.objectives.rewards import reward_name
 from cprl.policies.actors import random_agents
 from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
+from cprl.policies.governors import GovernorActor, Script, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import RULES_READ, ScriptedActor
 from cprl.population import (
     AgentSpec,
     Frozen,
+    GovernorSpec,
     Learning,
     Scripted,
     Team,
@@ -37,7 +39,16 @@ from cprl.population import (
     refuse_undecided,
     specs_by_agent,
 )
-from cprl.training.stored import LoadedRun, StoredAgent, decision_values, load, stored_actors, trained_agent
+from cprl.training.governing import Governing
+from cprl.training.stored import (
+    LoadedRun,
+    StoredAgent,
+    decision_values,
+    load,
+    stored_actors,
+    stored_governor,
+    trained_agent,
+)
 from cprl.values import Custom, instantiate, short_repr
 
 
@@ -64,6 +75,8 @@ class Population:
             weights is loaded next.
         weights: the names of the weights of `Frozen` agents by run, see `cprl.load`; runs not in it have
             their final ones.
+        governor: the specification of the governor; None leaves its first option in force.
+        governor_from_turn: the turns of the training before it decides.
     """
 
     def __init__(
@@ -77,6 +90,8 @@ class Population:
         engine: str = "compiled",
         starts: bool = True,
         weights: Mapping[str, str] | None = None,
+        governor: GovernorSpec | None = None,
+        governor_from_turn: int = 0,
     ) -> None:
         known = get_args(TrainingEngine)
         if engine not in known:
@@ -107,6 +122,9 @@ class Population:
         self.decisions: BanditDecider | None = self._make_decider()
         """The decisions of the agents on the game's ballots, and how they learn them; None without
         ballots."""
+        self._governor_spec = governor
+        self.governor = self._make_governor(governor_from_turn, weights or {})
+        """The governor, and how it learns; None without one."""
 
     @property
     def playing(self) -> Game | Spaces:
@@ -125,7 +143,8 @@ class Population:
             decisions = self.decisions.without_exploration(
                 Purpose.EVALUATED_DECISIONS, replicas=self.replicas, worlds=worlds
             )
-        return JointPolicy(actors, decisions=decisions)
+        governor = self.governor_actor(Purpose.EVALUATION, worlds=worlds)
+        return JointPolicy(actors, decisions=decisions, governor=governor)
 
     def random_policy(self, worlds: int) -> JointPolicy:
         """Return policies that take every action, and every choice of a decision, with equal probability."""
@@ -141,14 +160,89 @@ class Population:
             seed=self.seed,
             purpose=Purpose.RANDOM_PLAY,
         )
-        return JointPolicy(actors, decisions=decisions)
+        governor = None
+        if self._governor_spec is not None:
+            spaces = governor_spaces(self._game)
+            (by,) = random_agents(
+                spaces, (self._game.agents,), replicas=self.replicas, seed=self.seed, worlds=worlds
+            ).values()
+            governor = GovernorActor(self._game.governor, by)
+        return JointPolicy(actors, decisions=decisions, governor=governor)
 
     def networks(self) -> dict[str, nn.Module]:
         """Return copies of the learners' current acting networks, by "replica_0/agent_0" and so on."""
         networks: dict[str, nn.Module] = {}
         for learner in self.learners.values():
             networks |= learner.networks()
-        return networks
+        return networks if self.governor is None else networks | self.governor.networks()
+
+    def governor_as_stored(self, replicas: Sequence[int]) -> list[StoredAgent]:
+        """Return copies of the current governor of some replicas; [] without one."""
+        if self.governor is None:
+            return []
+        if self.governor.learner is None:
+            return [self._stored_governor[self._replica_numbers.index(replica)] for replica in replicas]
+        networks = self.governor.networks()
+        lanes = [lane_name(replica, self.spaces.agents) for replica in replicas]
+        return [trained_agent(self._governor_spec, networks[lane], None) for lane in lanes]
+
+    def governor_actor(self, purpose: Purpose, *, worlds: int, from_turn: int = 0) -> GovernorActor | None:
+        """Return the actor of the current governor for several worlds of each replica, with random numbers
+        for a purpose; None without a governor."""
+        if self._governor_spec is None:
+            return None
+        if self._stored_governor:
+            seeds = partial(lane_seeds, self.seed, replicas=self._replica_numbers, purpose=purpose)
+            return stored_governor(
+                self._game, self._stored_governor, seeds=seeds, worlds=worlds, from_turn=from_turn
+            )
+        assert self.governor is not None
+        assert self.governor.learner is not None
+        return GovernorActor(self._game.governor, self.governor.learner.evaluation_actor(worlds))
+
+    def _make_governor(self, from_turn: int, weights: Mapping[str, str]) -> Governing | None:
+        """Return the governor of a training; None without one."""
+        spec = self._governor_spec
+        self._stored_governor: list[StoredAgent] = []
+        if spec is None:
+            return None
+        if self._game is None or self._game.governor is None:
+            raise ValueError(f"governor is {spec}; allowed in a game without a Governor: None")
+        learner = None
+        if isinstance(spec, Learning):
+            learner = self._make_governor_learner(spec)
+            actor = GovernorActor(self._game.governor, learner.actor, from_turn=from_turn)
+        else:
+            self._stored_governor = self._load_governor(spec, weights)
+            actor = self.governor_actor(Purpose.EXPLORATION, worlds=self.worlds, from_turn=from_turn)
+        return Governing(self._game, actor, learner)
+
+    def _make_governor_learner(self, spec: Learning) -> Any:
+        """Return the learner of a governor, which counts as the agent after the last one."""
+        lanes = Lanes(
+            governor_spaces(self._game),
+            agents=(self.spaces.agents,),
+            replicas=self.replicas,
+            worlds=self.worlds,
+            seed=self.seed,
+            first_replica=self._replica_numbers.start,
+            device=self.device,
+        )
+        return _algorithm_of(spec).make_learner(lanes, "eager")
+
+    def _load_governor(self, spec: Frozen | Script, weights: Mapping[str, str]) -> list[StoredAgent]:
+        """Return the governor of each replica that does not learn."""
+        if not isinstance(spec, Frozen):
+            return [StoredAgent(scripted=spec)] * self.replicas
+        run = load(spec.run, weights=weights.get(spec.run))
+        there = getattr(run.game, "governor", None)
+        here = self._game.governor
+        if there is None or (there.sees, there.options) != (here.sees, here.options):
+            raise ValueError(f"the game of {run.path} has {there}; allowed for {spec}: one that sees and "
+                f"chooses from the same as {here}")
+        if spec.agent != run.game.agents:
+            raise ValueError(f"governor is {spec}; allowed: the agent after the last one, {run.game.agents}")
+        return [run.agent(spec.agent, replica=spec.replica_for(replica)) for replica in self._replica_numbers]
 
     def as_stored(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
         """Return copies of the current agents of some replicas, by agent and replica."""
@@ -297,6 +391,7 @@ def refuse_other_worlds(earlier: EnvBase, env: EnvBase, name: str, others: Itera
     pairs |= _pairs(games[0], spaces_of(earlier), games[1], spaces_of(env))
     if games[0] is not None and games[1] is not None:
         pairs["ballots"] = _ballot_choices(games[0]), _ballot_choices(games[1])
+        pairs["a governor:"] = games[0].governor, games[1].governor
         for actor in others:
             if isinstance(actor, ScriptedActor):
                 for rule in RULES_READ[actor.policy]:
