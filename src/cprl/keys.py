@@ -79,8 +79,8 @@ SEEN: Final = "seen"
 """float32 [B, S]: what the governor sees, see `Governor.sees`; only in games with a governor."""
 
 RULE: Final = "rule"
-"""int64 [B]: the option that the governor puts in force in this turn, an index into `Governor.options`, at the
-root like an action of the world. A turn without the entry leaves in force what is."""
+"""int64 [B]: the option that the governor puts in force in this turn, an index of `Governor.options`. A turn
+without the entry leaves in force what is."""
 
 BALLOTS_DUE: Final = "ballots_due"
 """bool [B, V]: which of `Game.ballots` are held in the coming turn, by the agents' decisions in it."""

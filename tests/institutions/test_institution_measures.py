@@ -59,7 +59,11 @@ FINES = np.array([2.0, 0.0, 1.0, 0.0])
 TRANSFERS = np.array([0.0, 1.0, 0.0, 2.0])
 IN_PLAY = np.array([10, 10, 8, 4])
 TAGS = np.array([2, 1, 1, 0])
-OF_LAW = [name for name, metric in METRICS.items() if metric.is_of_institutions]
+OF_LAW = [
+    name
+    for name, metric in METRICS.items()
+    if metric.is_of_institutions and "wanted" not in metric.needs  # which games with a governor have
+]
 OF_GROUPS = {name for name in OF_LAW if name.endswith(("_within", "_between"))}
 COUNTED = {
     "own_bites": np.array([5, 2, 3, 0]),

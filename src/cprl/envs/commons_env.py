@@ -46,7 +46,9 @@ _SMALL_OUTPUT_BYTES: Final = 2**16
 a turn of one world."""
 _TURNS_PER_ALLOCATION: Final = 16
 """The number of turns whose small outputs share one allocation."""
-_WRITTEN_ENTRIES: Final = frozenset((*StepOutput._fields, keys.SEEN, keys.STATE, keys.AGENTS, "next", "_reset"))
+_WRITTEN_ENTRIES: Final = frozenset(
+    (*StepOutput._fields, keys.SEEN, keys.STATE, keys.AGENTS, "next", "_reset")
+)
 """The entries that the environment writes in every turn; all others are carried over from the turn before."""
 
 

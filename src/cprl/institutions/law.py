@@ -21,12 +21,15 @@ MODULES: Final = {
 """The modules of institutions by their fields in `Law`, which have the names of the modules."""
 
 
-INSTITUTION_KINDS: Final[tuple[type[Institution], ...]] = tuple(
-    kind
-    for module in MODULES.values()
-    for kind in vars(module).values()
-    if isinstance(kind, type) and issubclass(kind, Institution) and kind.__module__ == module.__name__
-) + (Governor,)
+INSTITUTION_KINDS: Final[tuple[type[Institution], ...]] = (
+    *(
+        kind
+        for module in MODULES.values()
+        for kind in vars(module).values()
+        if isinstance(kind, type) and issubclass(kind, Institution) and kind.__module__ == module.__name__
+    ),
+    Governor,
+)
 """The classes of all institutions that a game can have."""
 
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.institutions import Governor
+from cprl.institutions.institution import Amount
 from cprl.policies.actors import LaneActor
 from cprl.values import Share, Value
 
@@ -59,7 +60,7 @@ class Constant(Value):
         number: one of its options.
     """
 
-    number: float
+    number: Amount
 
     def check(self, governor: Governor) -> None:
         """Raise a ValueError for a governor without this option."""

@@ -238,8 +238,10 @@ class Population:
         there = getattr(run.game, "governor", None)
         here = self._game.governor
         if there is None or (there.sees, there.options) != (here.sees, here.options):
-            raise ValueError(f"the game of {run.path} has {there}; allowed for {spec}: one that sees and "
-                f"chooses from the same as {here}")
+            raise ValueError(
+                f"the game of {run.path} has {there}; allowed for {spec}: one that sees and "
+                f"chooses from the same as {here}"
+            )
         if spec.agent != run.game.agents:
             raise ValueError(f"governor is {spec}; allowed: the agent after the last one, {run.game.agents}")
         return [run.agent(spec.agent, replica=spec.replica_for(replica)) for replica in self._replica_numbers]
