@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 from cprl.experiment import Experiment
-from cprl.experiment.engine import engine_of
 from cprl.population import Frozen, partners_in, with_stored
 from cprl.runs.checkpoints import endings_of
 from cprl.runs.files import (
@@ -88,7 +87,7 @@ class Trial:
             replicas=self.block.replicas,
             agents=agents,
             governor=with_stored(experiment.governor, in_block),
-            engine=engine_of(experiment),
+            engine=self.condition.engine,
         )
 
     @cached_property
