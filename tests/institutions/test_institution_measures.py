@@ -15,6 +15,7 @@ from cprl.institutions import (
     COUNT_NAMES,
     Boundaries,
     ClosedSeason,
+    Governor,
     GraduatedSanctions,
     Levies,
     Mediation,
@@ -435,6 +436,7 @@ def test_a_game_with_all_institutions_has_all_metrics_and_others_those_that_conc
         Tax,
         Levies,
         Vote,
+        Governor,
         Sanctioner,
         Punishment,
     }

@@ -100,7 +100,7 @@ class GovernorActor(nn.Module):
     def __init__(self, governor: Governor, by: LaneActor | Script, *, from_turn: int = 0) -> None:
         super().__init__()
         self.governor = governor
-        self.by = by
+        self.by: Any = by
         self._from_turn = from_turn
         self.turns = 0
         """The turns so far."""
@@ -115,12 +115,16 @@ class GovernorActor(nn.Module):
             self.rule = torch.zeros(len(seen), dtype=torch.int64, device=seen.device)
         if self.turns >= self._from_turn and self.turns % self.governor.every_steps == 0:
             self.seen = seen
-            if isinstance(self.by, LaneActor):
-                self.rule = self.by.choose(seen[:, None])[:, 0]
-            else:
-                self.rule = self.by.choose(self.governor, seen)
+            self.rule = self._choose(seen)
         self.turns += 1
         return self.rule
+
+    def _choose(self, seen: Tensor) -> Tensor:
+        """Return the options for B worlds; one world is played by the governor of the first replica."""
+        if not isinstance(self.by, LaneActor):
+            return self.by.choose(self.governor, seen)
+        worlds = self.by.replicas * self.by.worlds
+        return self.by.choose(seen.expand(worlds, -1)[:, None])[: len(seen), 0]
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"turns": self.turns, "rule": self.rule, "seen": self.seen}

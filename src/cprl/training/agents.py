@@ -22,7 +22,7 @@ from cprl.networks.recurrent import state_shape_of
 from cprl.objectives.rewards import reward_name
 from cprl.policies.actors import random_agents
 from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
-from cprl.policies.governors import GovernorActor, Script, governor_spaces
+from cprl.policies.governors import governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import RULES_READ, ScriptedActor
@@ -46,7 +46,6 @@ from cprl.training.stored import (
     decision_values,
     load,
     stored_actors,
-    stored_governor,
     trained_agent,
 )
 from cprl.values import Custom, instantiate, short_repr
@@ -122,8 +121,7 @@ class Population:
         self.decisions: BanditDecider | None = self._make_decider()
         """The decisions of the agents on the game's ballots, and how they learn them; None without
         ballots."""
-        self._governor_spec = governor
-        self.governor = self._make_governor(governor_from_turn, weights or {})
+        self.governor = self._make_governor(governor, governor_from_turn, weights or {})
         """The governor, and how it learns; None without one."""
 
     @property
@@ -143,7 +141,7 @@ class Population:
             decisions = self.decisions.without_exploration(
                 Purpose.EVALUATED_DECISIONS, replicas=self.replicas, worlds=worlds
             )
-        governor = self.governor_actor(Purpose.EVALUATION, worlds=worlds)
+        governor = None if self.governor is None else self.governor.evaluation_actor(worlds)
         return JointPolicy(actors, decisions=decisions, governor=governor)
 
     def random_policy(self, worlds: int) -> JointPolicy:
@@ -160,13 +158,7 @@ class Population:
             seed=self.seed,
             purpose=Purpose.RANDOM_PLAY,
         )
-        governor = None
-        if self._governor_spec is not None:
-            spaces = governor_spaces(self._game)
-            (by,) = random_agents(
-                spaces, (self._game.agents,), replicas=self.replicas, seed=self.seed, worlds=worlds
-            ).values()
-            governor = GovernorActor(self._game.governor, by)
+        governor = None if self.governor is None else self.governor.random_actor(worlds)
         return JointPolicy(actors, decisions=decisions, governor=governor)
 
     def networks(self) -> dict[str, nn.Module]:
@@ -176,75 +168,24 @@ class Population:
             networks |= learner.networks()
         return networks if self.governor is None else networks | self.governor.networks()
 
-    def governor_as_stored(self, replicas: Sequence[int]) -> list[StoredAgent]:
-        """Return copies of the current governor of some replicas; [] without one."""
-        if self.governor is None:
-            return []
-        if self.governor.learner is None:
-            return [self._stored_governor[self._replica_numbers.index(replica)] for replica in replicas]
-        networks = self.governor.networks()
-        lanes = [lane_name(replica, self.spaces.agents) for replica in replicas]
-        return [trained_agent(self._governor_spec, networks[lane], None) for lane in lanes]
-
-    def governor_actor(self, purpose: Purpose, *, worlds: int, from_turn: int = 0) -> GovernorActor | None:
-        """Return the actor of the current governor for several worlds of each replica, with random numbers
-        for a purpose; None without a governor."""
-        if self._governor_spec is None:
-            return None
-        if self._stored_governor:
-            seeds = partial(lane_seeds, self.seed, replicas=self._replica_numbers, purpose=purpose)
-            return stored_governor(
-                self._game, self._stored_governor, seeds=seeds, worlds=worlds, from_turn=from_turn
-            )
-        assert self.governor is not None
-        assert self.governor.learner is not None
-        return GovernorActor(self._game.governor, self.governor.learner.evaluation_actor(worlds))
-
-    def _make_governor(self, from_turn: int, weights: Mapping[str, str]) -> Governing | None:
-        """Return the governor of a training; None without one."""
-        spec = self._governor_spec
-        self._stored_governor: list[StoredAgent] = []
+    def _make_governor(
+        self, spec: GovernorSpec | None, from_turn: int, weights: Mapping[str, str]
+    ) -> Governing | None:
+        """Return the governor, which counts as the agent after the last one; None without one."""
         if spec is None:
             return None
         if self._game is None or self._game.governor is None:
             raise ValueError(f"governor is {spec}; allowed in a game without a Governor: None")
-        learner = None
-        if isinstance(spec, Learning):
-            learner = self._make_governor_learner(spec)
-            actor = GovernorActor(self._game.governor, learner.actor, from_turn=from_turn)
-        else:
-            self._stored_governor = self._load_governor(spec, weights)
-            actor = self.governor_actor(Purpose.EXPLORATION, worlds=self.worlds, from_turn=from_turn)
-        return Governing(self._game, actor, learner)
-
-    def _make_governor_learner(self, spec: Learning) -> Any:
-        """Return the learner of a governor, which counts as the agent after the last one."""
         lanes = Lanes(
             governor_spaces(self._game),
-            agents=(self.spaces.agents,),
+            agents=(self._game.agents,),
             replicas=self.replicas,
             worlds=self.worlds,
             seed=self.seed,
             first_replica=self._replica_numbers.start,
             device=self.device,
         )
-        return _algorithm_of(spec).make_learner(lanes, "eager")
-
-    def _load_governor(self, spec: Frozen | Script, weights: Mapping[str, str]) -> list[StoredAgent]:
-        """Return the governor of each replica that does not learn."""
-        if not isinstance(spec, Frozen):
-            return [StoredAgent(scripted=spec)] * self.replicas
-        run = load(spec.run, weights=weights.get(spec.run))
-        there = getattr(run.game, "governor", None)
-        here = self._game.governor
-        if there is None or (there.sees, there.options) != (here.sees, here.options):
-            raise ValueError(
-                f"the game of {run.path} has {there}; allowed for {spec}: one that sees and "
-                f"chooses from the same as {here}"
-            )
-        if spec.agent != run.game.agents:
-            raise ValueError(f"governor is {spec}; allowed: the agent after the last one, {run.game.agents}")
-        return [run.agent(spec.agent, replica=spec.replica_for(replica)) for replica in self._replica_numbers]
+        return Governing(self._game, self._game.governor, spec, lanes, from_turn=from_turn, weights=weights)
 
     def as_stored(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
         """Return copies of the current agents of some replicas, by agent and replica."""

@@ -191,9 +191,14 @@ class Evaluations:
             load_transforms_state(env, transforms_state(self._env))
             agents = self._population.as_stored(group)
             playing = self._population.playing
-            governor = self._population.governor_as_stored(group)
+            governor = self._population.governor
             policies = stored_policies(
-                agents, playing, replicas=group, worlds=worlds, seed=seed, governor=governor
+                agents,
+                playing,
+                replicas=group,
+                worlds=worlds,
+                seed=seed,
+                governor=() if governor is None else governor.as_stored(group),
             )
             episodes = evaluate(env, policies, metrics=experiment.metrics)
             for index, replica in enumerate(group):

@@ -1,6 +1,6 @@
 """A governor in a training: it decides, and learns from periods of many turns, at its own clock."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,18 @@ from torch import Tensor, nn
 
 from cprl import keys
 from cprl.commons.game import Game
+from cprl.institutions import Governor
 from cprl.keys import Turn
+from cprl.learners.lanes import Lanes
 from cprl.learners.learner import Learner
 from cprl.measuring.social import incomes_of
 from cprl.measuring.welfare import welfare
-from cprl.policies.governors import GovernorActor
+from cprl.policies.actors import LaneActor
+from cprl.policies.governors import GovernorActor, Script
+from cprl.policies.rng import Purpose, lane_name
+from cprl.population import Frozen, GovernorSpec, Learning
+from cprl.training.stored import StoredAgent, load, stored_governor, trained_agent
+from cprl.values import instantiate
 from cprl.values.array_types import AnyArray, Float64
 
 
@@ -28,14 +35,37 @@ class Governing:
 
     Args:
         game: the game with the governor.
-        actor: decides in the training.
-        learner: learns, as the agent after the last one; None for a governor that does not learn.
+        governor: the governor.
+        spec: how it decides.
+        lanes: the governor as the agent after the last one, see `governor_spaces`.
+        from_turn: the turns before its first decision.
+        weights: the names of the weights of `Frozen` agents by run, see `cprl.load`.
     """
 
-    def __init__(self, game: Game, actor: GovernorActor, learner: Learner | None) -> None:
-        self.actor = actor
-        self.learner = learner
+    def __init__(
+        self,
+        game: Game,
+        governor: Governor,
+        spec: GovernorSpec,
+        lanes: Lanes,
+        *,
+        from_turn: int = 0,
+        weights: Mapping[str, str] | None = None,
+    ) -> None:
         self._game = game
+        self._governor = governor
+        self._spec = spec
+        self._lanes = lanes
+        self.learner: Learner | None = None
+        """Learns, as the agent after the last one; None for a governor that does not learn."""
+        self._stored: list[StoredAgent] = []
+        """The governor of each replica; [] if it learns."""
+        if isinstance(spec, Learning):
+            self.learner = instantiate(spec.algorithm).make_learner(lanes, "eager")
+            self.actor = GovernorActor(governor, self.learner.actor, from_turn=from_turn)
+        else:
+            self._stored = self._load(spec, weights or {})
+            self.actor = self._stored_actor(Purpose.EXPLORATION, lanes.worlds, from_turn)
         self._income: AnyArray = np.zeros((0, game.agents))
         """The incomes of the turns of this period that count, [B, N]; [0, N] before the first turn."""
         self._last: dict[str, AnyArray] = {}
@@ -48,7 +78,6 @@ class Governing:
 
     def store(self, turn: Turn) -> None:
         """Count a turn; at the end of a period store its transitions and learn."""
-        governor = self.actor.governor
         if self.actor.seen is None:
             return
         if not self._last:
@@ -65,14 +94,14 @@ class Governing:
         }
         for name, entry in entries.items():
             self._last[name][counts] = _array(entry)[counts]
-        if self.actor.turns % governor.every_steps == 0:
+        if self.actor.turns % self._governor.every_steps == 0:
             self._end_period()
 
     def _begin(self, worlds: int) -> None:
         """Begin a period of B worlds."""
         self._income = np.zeros((worlds, self._game.agents))
         self._last = {
-            "seen": np.zeros((worlds, len(self.actor.governor.sees)), np.float32),
+            "seen": np.zeros((worlds, len(self._governor.sees)), np.float32),
             "stock": np.zeros(worlds, np.int64),
             "steps": np.zeros(worlds, np.int64),
             "done": np.zeros(worlds, np.bool_),
@@ -83,7 +112,7 @@ class Governing:
         """Compute the rewards of a period, learn from it, and forget it."""
         last = self._last
         stock = last["stock"] / len(self._game.map.sites)
-        self._reward = welfare(self.actor.governor, self._income, last["steps"], stock)
+        self._reward = welfare(self._governor, self._income, last["steps"], stock)
         if self.learner is not None:
             batch = self._transitions()
             self.learner.store(batch)
@@ -129,6 +158,50 @@ class Governing:
     def networks(self) -> dict[str, nn.Module]:
         """Return copies of its networks, by "replica_0/agent_N" and so on; none if it does not learn."""
         return {} if self.learner is None else self.learner.networks()
+
+    def evaluation_actor(self, worlds: int) -> GovernorActor:
+        """Return an actor of the current governor for several worlds of each replica."""
+        if self.learner is None:
+            return self._stored_actor(Purpose.EVALUATION, worlds)
+        return GovernorActor(self._governor, self.learner.evaluation_actor(worlds))
+
+    def random_actor(self, worlds: int) -> GovernorActor:
+        """Return an actor that decides at random, for several worlds of each replica."""
+        options = len(self._governor.options)
+        seeds = self._lanes.agent_seeds(Purpose.RANDOM_PLAY)
+        return GovernorActor(self._governor, LaneActor(None, options, seeds=seeds, agents=1, worlds=worlds))
+
+    def as_stored(self, replicas: Sequence[int]) -> list[StoredAgent]:
+        """Return copies of the current governor of some replicas."""
+        if not isinstance(self._spec, Learning):
+            return [self._stored[replica - self._lanes.first_replica] for replica in replicas]
+        networks = self.networks()
+        lanes = [lane_name(replica, self._game.agents) for replica in replicas]
+        return [trained_agent(self._spec, networks[lane], None) for lane in lanes]
+
+    def _stored_actor(self, purpose: Purpose, worlds: int, from_turn: int = 0) -> GovernorActor:
+        """Return the actor of a governor that does not learn, with random numbers for a purpose."""
+        seeds = self._lanes.agent_seeds(purpose)
+        return stored_governor(self._game, self._stored, seeds=seeds, worlds=worlds, from_turn=from_turn)
+
+    def _load(self, spec: Frozen | Script, weights: Mapping[str, str]) -> list[StoredAgent]:
+        """Return the governor of each replica, of an earlier run or a script; refuse one that sees or chooses
+        from something else."""
+        first = self._lanes.first_replica
+        replicas = range(first, first + self._lanes.replicas)
+        if not isinstance(spec, Frozen):
+            return [StoredAgent(scripted=spec) for _ in replicas]
+        run = load(spec.run, weights=weights.get(spec.run))
+        there = run.game.governor if isinstance(run.game, Game) else None
+        here = self._governor
+        if there is None or (there.sees, there.options) != (here.sees, here.options):
+            raise ValueError(
+                f"the game of {run.path} has the governor {there}; allowed for {spec}: one that sees and "
+                f"chooses from the same as {here}"
+            )
+        if spec.agent != run.game.agents:
+            raise ValueError(f"governor is {spec}; allowed: the agent after the last one, {run.game.agents}")
+        return [run.agent(spec.agent, replica=spec.replica_for(replica)) for replica in replicas]
 
     def state_dict(self) -> dict[str, Any]:
         return {

@@ -308,7 +308,8 @@ def stored_policies(
     actors = stored_actors(by_index, playing, kinds=kinds, seeds=seeds, worlds=worlds, stacks=True)
     governs = None
     if isinstance(playing, Game) and governor:
-        governs = stored_governor(playing, governor, seeds=seeds, worlds=worlds)
+        lanes = seeds(agents=[playing.agents])
+        governs = stored_governor(playing, governor, seeds=lanes, worlds=worlds)
     return JointPolicy(actors, decisions=decisions, governor=governs)
 
 
@@ -316,7 +317,7 @@ def stored_governor(
     game: Game,
     stored: Sequence[StoredAgent],
     *,
-    seeds: Callable[..., Sequence[Sequence[int]]],
+    seeds: Sequence[Sequence[int]],
     worlds: int,
     from_turn: int = 0,
 ) -> GovernorActor:
@@ -324,16 +325,19 @@ def stored_governor(
 
     Args:
         stored: the governor of each replica.
-        seeds: returns the seeds of the lanes of some `agents`.
+        seeds: the seed of each replica.
         from_turn: see `GovernorActor`.
     """
     assert game.governor is not None
     by: Any = stored[0].scripted
     if by is None:
-        kinds = {game.agents: stored[0].kind}
-        spaces = governor_spaces(game)
         (by,) = stored_actors(
-            {game.agents: stored}, spaces, kinds=kinds, seeds=seeds, worlds=worlds, stacks=True
+            {game.agents: stored},
+            governor_spaces(game),
+            kinds={game.agents: stored[0].kind},
+            seeds=lambda agents: seeds,
+            worlds=worlds,
+            stacks=True,
         ).values()
     return GovernorActor(game.governor, by, from_turn=from_turn)
 
