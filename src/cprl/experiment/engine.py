@@ -59,8 +59,9 @@ def _settings_of(algorithm: Any) -> Any:
     """Return the settings of an algorithm as its recipe holds them, so that a custom one has the same before
     and after it is stored; None without settings of cprl."""
     table = to_config(algorithm)
-    settings = table["arguments"] if table["kind"] == "Custom" else table
-    settings = settings.get("settings")
+    if table["kind"] != "Custom":
+        return getattr(algorithm, "settings", None)
+    settings = table["arguments"].get("settings")
     if not is_value(settings):
         return None
     try:
