@@ -208,6 +208,13 @@ def meaning_of(institution: Institution, game: Game) -> str:
     raise TypeError(f"{type(institution).__name__} has no sentence in cprl.pictures.readable")
 
 
+def sentences_of(game: Game) -> list[str]:
+    """Return the rules of a game in sentences, for those who play it."""
+    tag = tag_of(game)
+    tags = [f"{capitalised(tag)}."] if tag else []
+    return [growth_of(game), *tags, *(meaning_of(institution, game) for institution in game.institutions)]
+
+
 def _boundaries(boundaries: Boundaries, game: Game) -> str:
     fine = boundaries.bite_fine
     step_fine = boundaries.step_fine

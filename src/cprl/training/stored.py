@@ -23,11 +23,13 @@ from cprl.networks.finite import all_finite
 from cprl.networks.recurrent import state_cells_of
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.actors import LaneActor
+from cprl.policies.asking import CALLS, Calls
 from cprl.policies.decisions import ballot_sizes, stored_decisions
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
+from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
-from cprl.population import AgentSpec, Frozen, Learning, Person, Scripted, Team, specs_by_agent
+from cprl.population import AgentSpec, Frozen, Language, Learning, Person, Scripted, Team, specs_by_agent
 from cprl.runs.checkpoints import CHECKPOINTS
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, warn_of_changes
@@ -41,6 +43,10 @@ class StoredAgent:
 
     scripted: ScriptedPolicy | None = None
     """The policy that it follows; None for an agent that acts by a network."""
+    language: Language | None = None
+    """How a language model makes its plans, where it falls back to `scripted`; None without one."""
+    calls: Calls | None = field(default=None, repr=False)
+    """What keeps the calls of its model."""
     network: nn.Module | None = field(default=None, repr=False)
     stochastic: bool = False
     """True if the network outputs the logits of a policy; else it outputs action values."""
@@ -55,7 +61,7 @@ class StoredAgent:
     @property
     def kind(self) -> tuple[Any, ...]:
         """Return the kind of the agent; agents of one kind can be lanes of one actor."""
-        return self.scripted, self.stochastic, self.epsilon, self.algorithm
+        return self.scripted, self.language, self.stochastic, self.epsilon, self.algorithm
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -99,6 +105,13 @@ class LoadedRun:
         """Return the observations and actions of its agents, transforms included."""
         return spaces_of(self.env())
 
+    @cached_property
+    def calls(self) -> Calls:
+        """Return what keeps the calls of its language models, in its directory."""
+        calls = Calls()
+        calls.keep_in(self.path / CALLS)
+        return calls
+
     @property
     def playing(self) -> Game | Spaces:
         """Return what policies are made for: the game, or its spaces if it is not a game of cprl."""
@@ -129,6 +142,8 @@ class LoadedRun:
         spec = self.specs[agent]
         if isinstance(spec, Scripted):
             return StoredAgent(scripted=spec.policy)
+        if isinstance(spec, Language):
+            return language_agent(spec, self.calls)
         if isinstance(spec, Person):
             raise ValueError(
                 f"agent {agent} of {self.path} is a person: people cannot be played again; allowed: cprl "
@@ -168,6 +183,11 @@ class LoadedRun:
     def episodes(self) -> pa.Table:
         """Return the table of episodes; see `cprl.runs.episodes.read_episodes`."""
         return read_episodes(self.path)
+
+
+def language_agent(spec: Language, calls: Calls) -> StoredAgent:
+    """Return an agent for which a language model makes plans, and whose calls are kept."""
+    return StoredAgent(scripted=spec.fallback, language=spec, calls=calls)
 
 
 def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
@@ -314,6 +334,9 @@ def stored_actors(
         lanes = list(chain.from_iterable(by_replica))
         size: dict[str, Any] = {"seeds": seeds(agents=indices), "agents": len(indices), "worlds": worlds}
         stored = lanes[0]
+        if stored.language is not None and stored.calls is not None:
+            actors[tuple(indices)] = LanguageActor(stored.language, playing, calls=stored.calls, **size)
+            continue
         if stored.scripted is not None:
             actors[tuple(indices)] = scripted_lanes(stored.scripted, playing, **size)
             continue

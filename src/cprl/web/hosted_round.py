@@ -26,7 +26,7 @@ from cprl.evaluation.fresh import averages_of
 from cprl.experiment import Experiment
 from cprl.measuring.playing import evaluate
 from cprl.measuring.tracker import Episode, tracker_of
-from cprl.pictures.decoding import classes_seen
+from cprl.pictures.decoding import classes_seen, window_text
 from cprl.population import AgentSpec, Person, Scripted, has_people, partners_in
 from cprl.runs.episodes import append_batch, batches_in, stored_episodes
 from cprl.runs.files import REPORT, write_atomically
@@ -36,7 +36,6 @@ from cprl.training.agents import Population
 from cprl.training.stored import LoadedRun
 from cprl.values.array_types import Bool, Int64, UInt8
 from cprl.web.hosting import TRAINED
-from cprl.web.messages import SIGNS
 from cprl.web.scenes import moment_json, scene_json, window_colours
 from cprl.web.session import HostedSession, instructions_of, options_of
 
@@ -389,11 +388,10 @@ class HostedRound:
         observation = self._observation()[group, agent]
         if view == "array":
             return {"observation": b64encode(observation.tobytes()).decode()}
+        if view == "text":
+            return {"text": window_text(self.game, observation)}
         classes = classes_seen(self.game, observation[None, None])[0, 0]
-        if view == "window":
-            return {"window": b64encode(classes.tobytes()).decode()}
-        signs = np.vectorize(lambda kind: SIGNS.get(kind, "O"))(classes)
-        return {"text": "\n".join(map("".join, signs))}
+        return {"window": b64encode(classes.tobytes()).decode()}
 
     def result(self, group: int) -> dict[str, Any]:
         """Return how the round ended for a group, as messages say it."""

@@ -10,7 +10,7 @@ from cprl.commons.game import Game
 from cprl.evaluation.fresh import typical_replica
 from cprl.evaluation.play import board_named
 from cprl.institutions import Institution
-from cprl.pictures.readable import capitalised, growth_of, meaning_of, tag_of
+from cprl.pictures.readable import sentences_of
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.population import AgentSpec, Frozen, Scripted
 from cprl.training.stored import LoadedRun, load
@@ -110,12 +110,10 @@ def with_turns(game: Game, turns: int) -> Game:
 
 def instructions_of(game: Game, view: str) -> list[str]:
     """Return the rules of a game in sentences, for those who play it."""
-    tag = tag_of(game)
     seen = "the whole board" if view == "board" else "the cells around you, your heading up"
-    sentences = [growth_of(game), f"You see {seen}.", *([f"{capitalised(tag)}."] if tag else [])]
-    sentences += [meaning_of(institution, game) for institution in game.institutions]
-    steps = game.rules.episode_steps
-    return [*sentences, f"A round has {steps:,} turns at most; it ends earlier if no apple is left."]
+    growth, *rules = sentences_of(game)
+    end = f"A round has {game.rules.episode_steps:,} turns at most; it ends earlier if no apple is left."
+    return [growth, f"You see {seen}.", *rules, end]
 
 
 def options_of(game: Game) -> list[str] | None:
