@@ -1,6 +1,7 @@
 """Calls to a language model are made once, kept, limited, tried again, and never break what asks."""
 
 import json
+import os
 import socket
 
 import pytest
@@ -134,7 +135,7 @@ def test_a_stored_run_answers_without_a_network_and_a_changed_prompt_is_refused_
         calls.keep_in(first / CALLS)
         model = Model(base_url=server.url, **QUICK)
         calls.ask(model, [question(0), question(1)], number_in)
-    offline = Model(**QUICK, stored=str(first))
+    offline = Model(**QUICK, stored=os.path.relpath(first))
     again = Calls()
     again.keep_in(second / CALLS)
     assert again.ask(offline, [question(0), question(1)], number_in) == [0, 1]
@@ -170,8 +171,9 @@ def test_a_file_that_holds_something_else_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("field", "value"), [("base_url", "file:///etc"), ("max_calls", 0), ("timeout_s", 0), ("retries", -1)]
+    ("field", "value"),
+    [("base_url", "file:///etc"), ("max_calls", 0), ("timeout_s", 0), ("retries", -1), ("stored", "/a/run")],
 )
 def test_a_model_that_cannot_be_asked_is_refused(field, value):
-    with pytest.raises(ValueError, match=f"Model.{field}"):
+    with pytest.raises(ValueError, match=rf"Model\.{field}"):
         Model(**{"model": "small", field: value})

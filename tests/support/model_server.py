@@ -2,7 +2,7 @@
 
 import json
 import time
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from threading import Lock, Thread
 
@@ -19,7 +19,7 @@ def plan(request):
 
 
 class ModelServer:
-    """Answers each request by `answer(request)`: a text, a status that is refused, or one of the bad answers."""
+    """Answers each request by `answer(request)`: a text, a status of failure, or one of the bad answers."""
 
     def __init__(self, answer=plan):
         self.answer = answer
@@ -71,10 +71,8 @@ def served(answer=plan):
 
     class Handler(BaseHTTPRequestHandler):
         def do_POST(self):
-            try:
+            with suppress(BrokenPipeError, ConnectionResetError):  # who asked has stopped waiting
                 model.reply(self)
-            except (BrokenPipeError, ConnectionResetError):
-                pass  # who asked has stopped waiting
 
         def log_message(self, *words):
             pass

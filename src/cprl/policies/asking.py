@@ -13,6 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from hashlib import sha256
 from http.client import HTTPException
+from os.path import isabs
 from pathlib import Path
 from threading import Lock
 from typing import Annotated, Any, Final, NamedTuple, TypeVar
@@ -71,9 +72,11 @@ class Model(Value, stored=False):
     """The seconds before the first retry, doubled before each further one."""
     concurrency: Annotated[int, Range(1, 256)] = 4
     """The most calls at the same time."""
-    stored: str | None = None
-    """The directory of a run, from the working directory, whose calls answer instead of the server; a request
-    that it does not keep is refused by name. None to ask the server."""
+    stored: (
+        Annotated[str, Where(lambda path: not isabs(path), "a path from the working directory")] | None
+    ) = None
+    """The directory of a run whose calls answer instead of the server; a request that it does not keep is
+    refused by name. None to ask the server."""
 
 
 class Question(NamedTuple):

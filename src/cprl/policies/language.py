@@ -107,6 +107,7 @@ class _BoardPlans:
             [
                 f"You are one of {self.game.agents} agents on a board. {' '.join(sentences_of(self.game))}",
                 f"An episode has {rules.episode_steps:,} turns at most; it ends earlier if no apple is left.",
+                "Each apple that you pick is a point for you.",
                 f"Every {spec.every_steps} turns you choose a plan, which is played for you. Answer with one",
                 "JSON object and nothing else:",
                 f'{{"why": "a short reason", "policy": a name of the list, "spare": 1 to 8{signals}}}',
