@@ -52,4 +52,5 @@ def classes_seen(game: Game, windows: UInt8) -> UInt8:
 def window_text(game: Game, window: UInt8) -> str:
     """Return what an agent observed, uint8 [C, X, Y], as lines of `SIGNS`."""
     classes = classes_seen(game, window[None, None])[0, 0]
-    return "\n".join("".join(SIGNS.get(kind, "O") for kind in row) for row in classes.tolist())
+    signs = np.vectorize(lambda kind: SIGNS.get(kind, "O"))(classes)
+    return "\n".join(map("".join, signs))

@@ -23,6 +23,7 @@ from urllib.request import Request, urlopen
 from cprl.values import Natural, Positive, Range, Value, Where, short_repr
 
 T = TypeVar("T")
+Text = Annotated[str, Where(lambda text: "\0" not in text, "a text without NUL")]
 
 CALLS: Final = "calls.jsonl"
 """The file of a run with its calls."""
@@ -49,13 +50,13 @@ _BUSY: Final = (408, 429)
 class Model(Value, stored=False):
     """A language model at a server with `/chat/completions`, and how it may be asked."""
 
-    model: str
+    model: Text
     """The model's name at the server, e.g. "qwen3:4b"."""
     base_url: Annotated[
         str, Where(lambda url: url.startswith(("http://", "https://")), "an address, http:// or https://")
     ] = "http://localhost:11434/v1"
     """The address before `/chat/completions`; by default that of Ollama on this machine."""
-    key_variable: str | None = None
+    key_variable: Text | None = None
     """The environment variable that holds the server's key, e.g. "OPENAI_API_KEY"; None for no key. The key
     itself is never stored."""
     temperature: Annotated[float, Range(0, 2)] = 0.0
@@ -73,7 +74,7 @@ class Model(Value, stored=False):
     concurrency: Annotated[int, Range(1, 256)] = 4
     """The most calls at the same time."""
     stored: (
-        Annotated[str, Where(lambda path: not isabs(path), "a path from the working directory")] | None
+        Annotated[Text, Where(lambda path: not isabs(path), "a path from the working directory")] | None
     ) = None
     """The directory of a run whose calls answer instead of the server; a request that it does not keep is
     refused by name. None to ask the server."""
@@ -130,21 +131,21 @@ class Calls:
             ValueError: if `Model.stored` lacks a call.
             ConnectionError: if the first call of all fails in a way that a retry cannot change.
         """
-        asked = {_hash(question.request(model)): question for question in questions}
-        new = [name for name in asked if name not in self.kept]
+        hashes = [_hash(question.request(model)) for question in questions]
+        by_hash = dict(zip(hashes, questions, strict=True))
+        new = [question for name, question in by_hash.items() if name not in self.kept]
         if new and model.stored is not None:
-            self._take(model, [asked[name] for name in new])
+            self._take(model, new)
         elif new:
             made = sum(call["tries"] > 0 for call in self.kept.values())
             count = max(0, model.max_calls - made)
 
             def make(index: int) -> None:
-                self._make(model, asked[new[index]], read, is_allowed=index < count)
+                self._make(model, new[index], read, is_allowed=index < count)
 
             with ThreadPoolExecutor(model.concurrency) as pool:
                 list(pool.map(make, range(len(new))))
-        answers = [self.kept[_hash(question.request(model))]["answer"] for question in questions]
-        return [_understood(answer, read)[0] for answer in answers]
+        return [_understood(self.kept[name]["answer"], read)[0] for name in hashes]
 
     def _make(
         self, model: Model, question: Question, read: Callable[[Any], Any], *, is_allowed: bool

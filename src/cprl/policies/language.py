@@ -8,7 +8,7 @@ back to a policy that was said beforehand.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Protocol
+from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
@@ -22,7 +22,7 @@ from cprl.commons.spaces import Spaces
 from cprl.pictures.decoding import SIGNS, window_text
 from cprl.pictures.readable import sentences_of
 from cprl.policies.actors import LaneActor
-from cprl.policies.asking import Calls, Model, Question
+from cprl.policies.asking import Calls, Model, Question, Text
 from cprl.policies.rng import Purpose, seed_of
 from cprl.policies.scripted import (
     BEHAVIOURS,
@@ -49,7 +49,7 @@ class Language(Model):
     """The steps from one plan to the next; as many as an episode has for a plan an episode."""
     fallback: ScriptedPolicy = "sustainable"
     """What it does where the model gives no plan; "random" in a game that is no `cprl.Game`."""
-    instructions: str = ""
+    instructions: Text = ""
     """Text before all else: a persona, a norm, or what a game of your own is about."""
 
 
@@ -65,41 +65,24 @@ class Plan(Value, stored=False, called="plan"):
     why: str = ""
 
 
-class _Answers(Protocol):
-    """What an agent is shown in a game, and how its answers become actions."""
-
-    in_keys: tuple[str, ...]
-    """The entries of "agents" that it reads beside observations."""
-    fallback: tuple[int, ...]
-    """The numbers of the plan of an agent without an answer."""
-
-    def rules(self, spec: Language) -> str:
-        """Return what a model has to know before it answers."""
-        ...
-
-    def seen(self, observation: AnyArray, memory: Float32) -> str:
-        """Return in words what an agent observes, and carries from turn to turn."""
-        ...
-
-    def read(self, table: Any) -> tuple[int, ...]:
-        """Return the numbers of a plan; raise a ValueError if it is not allowed."""
-        ...
-
-    def act(self, plans: Int64, tensordict: TensorDictBase) -> Int64:
-        """Return actions, int64 [B, S], by plans, [B, S, cells]."""
-        ...
-
-
 class _BoardPlans:
-    """Plans on a board: a scripted policy, the apples that it spares, and a signal."""
+    """Plans on a board: a scripted policy, the apples that it spares, and a signal.
+
+    Args:
+        game: the game that is played.
+        script: follows the policies; its own is the fallback.
+    """
 
     def __init__(self, game: Game, script: ScriptedActor) -> None:
         self.game = game
         self.fallback: tuple[int, ...] = (SCRIPTED_POLICIES.index(script.policy), SPARE, 0)
+        """The numbers of the plan of an agent without an answer."""
         self.in_keys: tuple[str, ...] = (keys.HARVEST[1], keys.IN_PLAY[1], *script.in_keys[1:])
+        """The entries of "agents" that it reads beside observations."""
         self._script = script
 
     def rules(self, spec: Language) -> str:
+        """Return what a model has to know before it answers."""
         rules = self.game.rules
         policies = [f'- "{policy}": {behaviour}' for policy, behaviour in BEHAVIOURS.items()]
         signals = f', "signal": 0 to {rules.signals}, which others see' * bool(rules.signals)
@@ -116,6 +99,7 @@ class _BoardPlans:
         )
 
     def seen(self, observation: AnyArray, memory: Float32) -> str:
+        """Return in words what an agent observes, and carries from turn to turn."""
         turn, _, harvest, *plan = memory.astype(np.int64).tolist()
         lines = [f"Turn {turn + 1} of {self.game.rules.episode_steps}. You picked {harvest} apples so far."]
         if turn:
@@ -138,8 +122,8 @@ class _BoardPlans:
             senders = np.count_nonzero(observation[game.channels.index(f"signal {number}")])
             lines += [f"Signal {number} was sent by {senders} of those you see."] * bool(senders)
         if game.observation.scoreboard:
-            shown = self._entries(observation, "scoreboard")[: game.agents].astype(np.int64)
-            scores = len(game.map.sites) * shown / np.maximum(1, 255 - shown)
+            bytes_ = self._entries(observation, "scoreboard")[: game.agents].astype(np.int64)
+            scores = len(game.map.sites) * bytes_ / np.maximum(1, 255 - bytes_)
             words = ", ".join(f"{score:.0f}" for score in scores.tolist())
             lines.append(f"Apples picked by you and the next agents: {words}.")
         if game.observation.stock_gauge:
@@ -156,11 +140,13 @@ class _BoardPlans:
         return observation[np.array(self.game.channels) == channel].reshape(-1)
 
     def read(self, table: Any) -> tuple[int, ...]:
+        """Return the numbers of a plan; raise a ValueError if it is not allowed."""
         plan = build(Plan, table, "plan")
         checked("plan.signal", plan.signal, Annotated[int, Range(0, self.game.rules.signals)])
         return SCRIPTED_POLICIES.index(plan.policy), plan.spare, plan.signal
 
     def act(self, plans: Int64, tensordict: TensorDictBase) -> Int64:
+        """Return actions, int64 [B, S], by plans, [B, S, 3]."""
         policies, spare, signal = np.moveaxis(plans, -1, 0)
         seen = map(tensordict.get, self._script.in_keys)
         silent = self._script.choose_each(policies, spare, *seen)
@@ -174,7 +160,7 @@ class _Action(Value, stored=False, called="answer"):
 
 
 class _PlainActions:
-    """Actions in a game that is no `cprl.Game`, which shows its agents numbers."""
+    """Actions in a game that is no `cprl.Game`, which shows its agents numbers; a plan is an action."""
 
     in_keys: tuple[str, ...] = ()
     fallback: tuple[int, ...] = (-1,)
@@ -240,7 +226,7 @@ class LanguageActor(TensorDictModuleBase):
         self.worlds = worlds
         self.replicas = len(seeds) // agents
         size: dict[str, Any] = {"seeds": seeds, "agents": agents, "worlds": worlds}
-        self._answers: _Answers
+        self._answers: _BoardPlans | _PlainActions
         if isinstance(playing, Game):
             self.script: Any = ScriptedActor(spec.fallback, playing, **size)
             self._answers = _BoardPlans(playing, self.script)

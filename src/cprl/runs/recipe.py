@@ -213,7 +213,7 @@ def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") ->
 
 
 STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)\.((start_from\.)?run|stored)")
-"""The path of a study's factor that is the run of a `Frozen` agent, or whose calls a `Language` agent takes."""
+"""The path of a study's factor that is a run."""
 _RUN_FIELDS: Final = {"Frozen": {"run"}, "Language": {"stored"}}
 """The fields that hold the path of a run, by kind."""
 

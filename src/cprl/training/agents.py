@@ -210,7 +210,7 @@ class Population:
         numbers = self._replica_numbers[:replicas]
         agents = {agent: stored[: len(numbers)] for agent, stored in self._stored_agents.items()}
         if purpose is Purpose.EXHIBITION:  # viewers cost no calls
-            agents = {agent: [replace(one, language=None) for one in agents[agent]] for agent in agents}
+            agents = {agent: list(map(_without_language, stored)) for agent, stored in agents.items()}
         kinds = {
             agent: (getattr(self._specs_by_agent[agent], "run", None), stored[0].kind)
             for agent, stored in agents.items()
@@ -280,6 +280,10 @@ class Population:
                 stored = run.agent(stored_agent, replica=stored_replica)
                 weights[lane_name(replica, agent)] = _loadable_weights(stored, algorithm, self.spaces, where)
         return weights
+
+
+def _without_language(agent: StoredAgent) -> StoredAgent:
+    return replace(agent, language=None)
 
 
 def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game: Game | None) -> None:
