@@ -17,9 +17,11 @@ from hosted_runs import hosted as hosted_run
 
 import cprl
 from cprl import institutions, keys
-from cprl.population import Person
+from cprl.measuring.playing import evaluate
+from cprl.population import Person, Scripted
 from cprl.runs.episodes import batches_in, read_episodes
 from cprl.runs.files import RunLockedError
+from cprl.training.agents import Population
 from cprl.web import hall as hall_module, hosted_round
 from cprl.web.hall import Hall, JoinRefusedError
 from cprl.web.hosted_round import Journal
@@ -417,4 +419,8 @@ def test_a_board_is_enlarged_for_its_seats_and_the_turns_of_greedy_players_are_k
     dying = small_game(regrow_prob=(0.0, 0.0), episode_steps=60)
     with hosted(tmp_path / "out", session(game=dying, people=3), monkeypatch) as hall:
         assert hall.rounds[0].game.agents == 3
-        assert 2 < hall.rounds[0].greedy_turns < 60
+        greedy = [Scripted("greedy")] * 3
+        env = cprl.CommonsEnv(hall.rounds[0].game, seed=hall.rounds[0].seed)
+        (episode,) = evaluate(env, Population(env, greedy, seed=hall.rounds[0].seed).policy(1))
+        assert 2 < episode.steps < 60
+        assert episode.terminated

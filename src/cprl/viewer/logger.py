@@ -133,15 +133,9 @@ def _send_rows(stream: Stream, rows_by_entity: Mapping[str, Sequence[BufferedRow
         if isinstance(values[0], str):
             columns = rr.TextDocument.columns(text=values)
         else:
-            columns = _line_columns(values)
+            columns = rr.Scalars.columns(scalars=np.concatenate(values)).partition(list(map(len, values)))
         recording.send_columns(entity, time_columns[times], columns)
     recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
-
-
-def _line_columns(rows: Sequence[Sequence[float]]) -> Any:
-    """Return the columns of plotted lines: in each row one number per line."""
-    line_counts = list(map(len, rows))
-    return rr.Scalars.columns(scalars=np.concatenate(rows)).partition(line_counts)
 
 
 class RerunLogger(Logger):

@@ -16,6 +16,7 @@ from tensordict import TensorDictBase
 
 from cprl.commons.cells import GROUND, WALL
 from cprl.envs.commons_env import CommonsEnv
+from cprl.measuring.social import gini, lorenz_curve
 from cprl.measuring.tracker import Episode
 from cprl.pictures.colours import GREEN, GREY, ORANGE, PALETTE, PURPLE, agent_colour
 from cprl.pictures.image import OwnedRegions
@@ -24,7 +25,7 @@ from cprl.viewer.board import RIM_CELLS
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import DIED, TEXT
 from cprl.viewer.scene import PLOT_HIGH, PLOT_WIDE, TITLE, Scene, boards_of
-from cprl.viewer.view import Learning, Numbers, View, has_died
+from cprl.viewer.view import Numbers, View, has_died
 
 Archetypes: TypeAlias = Mapping[str, Any]
 """Rerun's archetypes by entity."""
@@ -111,7 +112,7 @@ class Samples(View):
         for board, stock_by_turn in enumerate(self._running_stock):
             stock_by_turn.update(zip(turn[:, board, 0].tolist(), stock[:, board, 0].tolist(), strict=True))
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode) -> None:
         if episode.world >= len(self.lines):
             return
         self.evaluate()
@@ -253,28 +254,6 @@ def visit_maps(visits: Int64, scene: Scene) -> UInt8:
     return with_rim
 
 
-def lorenz_curve(harvest: Float64) -> Float64:
-    """Return the share of the harvest that the k agents with the least have together, for k = 0 to N.
-
-    Twice the area between the curve and the diagonal is the Gini coefficient, which is 1 - equality.
-
-    Args:
-        harvest: float [N], the apples of each agent.
-
-    Returns:
-        float [N + 1], from 0 to 1; NaN if there is no harvest.
-    """
-    total = harvest.sum()
-    if total <= 0:
-        return np.full(len(harvest) + 1, np.nan)
-    return np.concatenate([[0.0], np.sort(harvest).cumsum() / total])
-
-
-def gini(curve: Float64) -> float:
-    """Return the Gini coefficient of a Lorenz curve [N + 1], 0 for equal shares."""
-    return float(1 - (curve[1:] + curve[:-1]).sum() / (len(curve) - 1))
-
-
 _LORENZ_AXES: Final = Axes("lorenz", "agents, the poorest first, %", 100.0, 100.0)
 
 
@@ -360,7 +339,7 @@ class Pictures(View):
                 title = f"{picture.axes.origin}/title"
                 logger.log_columns(title, ([0], [0], [0]), notice, live_only=True)
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode) -> None:
         self._episodes.append(episode)
 
     def on_numbers(self, episode: int, numbers: Numbers) -> None:

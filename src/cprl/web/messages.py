@@ -52,10 +52,11 @@ From the server come:
 
 import json
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal, Self, TypeAlias
+from typing import Any, Final, Literal, Self, TypeAlias
 
 from cprl.commons.cells import APPLE, BEAM, CLEANING, GROUND, OTHER, SELF, WALL, WASTE, WATER
-from cprl.values import Natural, Value, Where, build, short_repr
+from cprl.values import Natural, Value, build, short_repr
+from cprl.web.hosting import ShortText
 
 MOST_BYTES: Final = 1024
 """The largest message that is read."""
@@ -74,7 +75,7 @@ SIGNS: Final = {
 
 
 @dataclass(frozen=True)
-class Join(Value, stored=False, called="join"):
+class Join(Value, stored=False):
     """What one posts to get a seat, or to ask for the one that one has."""
 
     token: str
@@ -87,17 +88,17 @@ class Join(Value, stored=False, called="join"):
 
 
 @dataclass(frozen=True)
-class Consent(Value, stored=False, called="consent"):
+class Consent(Value, stored=False):
     """A person consents to the text that was shown."""
 
 
 @dataclass(frozen=True)
-class Ready(Value, stored=False, called="ready"):
+class Ready(Value, stored=False):
     """A person has read what is shown."""
 
 
 @dataclass(frozen=True)
-class Action(Value, stored=False, called="action"):
+class Action(Value, stored=False):
     """The action for the coming turn, by its name, and the number that comes back with it."""
 
     action: str
@@ -105,27 +106,21 @@ class Action(Value, stored=False, called="action"):
 
 
 @dataclass(frozen=True)
-class Choice(Value, stored=False, called="vote"):
+class Choice(Value, stored=False):
     """The choice on the ballots of the coming round, as an index into its options."""
 
     option: Natural
 
 
 @dataclass(frozen=True)
-class Chat(Value, stored=False, called="chat"):
+class Chat(Value, stored=False):
     """A line to one's group."""
 
-    text: Annotated[
-        str,
-        Where(
-            lambda text: bool(text.strip()) and len(text) <= 200 and text.isprintable(),
-            "1 to 200 printable characters",
-        ),
-    ]
+    text: ShortText
 
 
 @dataclass(frozen=True)
-class Seeing(Value, stored=False, called="view"):
+class Seeing(Value, stored=False):
     """The form of one's turns from now on."""
 
     view: Literal["array", "text"]

@@ -3,7 +3,7 @@
 import os
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 from cprl.commons import maps
 from cprl.commons.game import Game
@@ -11,10 +11,10 @@ from cprl.evaluation.fresh import typical_replica
 from cprl.evaluation.play import board_named
 from cprl.institutions import Institution
 from cprl.pictures.readable import capitalised, growth_of, meaning_of, tag_of
-from cprl.policies.scripted import SCRIPTED_POLICIES
+from cprl.policies.scripted import ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted
 from cprl.training.stored import LoadedRun, load
-from cprl.values import refusal
+from cprl.values import checked, refusal
 from cprl.web.hosting import STAY, TRAINED, Hosting, ShortText
 
 Treatment: TypeAlias = Game | tuple[Institution, ...]
@@ -25,7 +25,7 @@ Treatment: TypeAlias = Game | tuple[Institution, ...]
 class HostedSession(Hosting, stored=False, called="session"):
     """A game that people play in groups, in one round or several, under treatments in an order."""
 
-    game: Game | ShortText
+    game: Game | str
     """The game; or the name of a published board, the directory of a run, or a file with a drawing."""
     rounds: tuple[tuple[ShortText, Treatment], ...] = ()
     """The treatment of each round with its name; () for one round of the game as it is."""
@@ -35,10 +35,8 @@ class HostedSession(Hosting, stored=False, called="session"):
     def __post_init__(self) -> None:
         super().__post_init__()
         for word in self.agents:
-            if word not in (TRAINED, *SCRIPTED_POLICIES):
-                raise refusal("session.agents", word, ", ".join((TRAINED, *SCRIPTED_POLICIES)))
-        if self.absent not in (STAY, *SCRIPTED_POLICIES):
-            raise refusal("session.absent", self.absent, ", ".join((STAY, *SCRIPTED_POLICIES)))
+            checked("session.agents", word, Literal["trained"] | ScriptedPolicy)
+        checked("session.absent", self.absent, Literal["stay"] | ScriptedPolicy)
 
     def games(self) -> list[tuple[str, Game]]:
         """Return the name and the game of each round, with a start for each agent.
