@@ -15,7 +15,6 @@ import numpy as np
 from PIL import Image
 from scipy.spatial.distance import cdist
 
-from cprl import keys
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.fresh import (
     FreshEpisode,
@@ -42,7 +41,7 @@ from cprl.system.output import legible
 from cprl.system.working import working
 from cprl.training.stored import LoadedRun
 from cprl.values import Positive, Range, Value, Where, checked, refusal
-from cprl.values.array_types import Bool, UInt8
+from cprl.values.array_types import UInt8
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.replay_views import Decisions, ViolationMarks, events
 
@@ -275,8 +274,6 @@ class _Panel(NamedTuple):
     title: str
     picture: EpisodePicture
     played: Recorded
-    violated: Bool
-    """bool [T + 1, N], the agents that broke a rule in the turn before each board."""
     is_typical: bool
     """Whether the episode was chosen as a typical one."""
 
@@ -303,7 +300,7 @@ class _Panel(NamedTuple):
             comes_to=f"{subject}: {apples}, {outcome}",
             end=end,
             card=card_text,
-            violators=np.flatnonzero(self.violated[since : turn + 1].any(0)).tolist(),
+            violators=np.flatnonzero(played.violated[since : turn + 1].any(0)).tolist(),
         )
 
 
@@ -317,8 +314,7 @@ def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) ->
     panels = []
     for title, population, game, played in zip(titles, fresh, games, episodes, strict=True):
         picture = EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes)
-        violated = played.since_the_start("next", *keys.VIOLATED) > 0
-        panels.append(_Panel(title, picture, played, violated, population.is_typical))
+        panels.append(_Panel(title, picture, played, population.is_typical))
     return panels
 
 

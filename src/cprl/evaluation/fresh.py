@@ -33,6 +33,7 @@ from cprl.system.output import say
 from cprl.system.working import working
 from cprl.training.stored import LoadedRun, as_loaded
 from cprl.values import Natural, Range, Seed, checked, refusal
+from cprl.values.array_types import Bool
 
 EPISODES_TRIED: Final = 5
 """The number of fresh episodes from which a typical one is chosen."""
@@ -268,6 +269,12 @@ class Recorded(NamedTuple):
     def is_dead(self) -> bool:
         """Return whether the board died: no apple was left and none could grow."""
         return self.episode.terminated and self.left == 0
+
+    @property
+    def violated(self) -> Bool:
+        """Return who broke a rule in the turn before each board, bool [T + 1, N]."""
+        violated: Bool = self.since_the_start("next", *keys.VIOLATED) > 0
+        return violated
 
     def since_the_start(self, *key: str) -> Any:
         """Return an entry of agents after each turn, with zeros for the start, [T + 1, N].

@@ -224,16 +224,13 @@ def run_scenarios(
                 labels = {"scenario": scenario.name, FOCAL: name, "focal_agents": indices}
                 yield play_fresh(fresh, loaded, agents, labels, roles=roles_of(count, placement))
 
-    played_names = {scenario.name for scenario in chosen}
-    all_names = {scenario.name for scenario in scenarios_of(loaded.game)}
-    missing = left_out_of(loaded.game) if played_names >= all_names else ""
     return join_tables(
         placement_tables(),
         heading=heading(f"Scenarios of {loaded.path.name}", fresh, [loaded], " in each placement"),
         run=loaded.path.name,
         fresh=fresh,
         weights=loaded.weights_from,
-        scenarios_left_out=missing,
+        scenarios_left_out="" if scenarios else left_out_of(loaded.game),
     )
 
 

@@ -19,7 +19,7 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.social import gini, lorenz_curve
 from cprl.measuring.tracker import Episode
 from cprl.pictures.colours import GREEN, GREY, ORANGE, PALETTE, PURPLE, agent_colour
-from cprl.pictures.image import OwnedRegions
+from cprl.pictures.image import OwnedRegions, region_colour
 from cprl.values.array_types import Bool, Float32, Float64, Int64, UInt8
 from cprl.viewer.board import RIM_CELLS
 from cprl.viewer.logger import RerunLogger
@@ -390,8 +390,7 @@ def borders(regions: OwnedRegions) -> Any:
     for owners, cells in regions:
         sides = _borders(cells)
         strips += sides
-        hue = agent_colour(owners[0]) if len(owners) == 1 else GREY
-        colours += [(*hue, _BORDER_OPACITY)] * len(sides)
+        colours += [(*region_colour(owners), _BORDER_OPACITY)] * len(sides)
     return rr.LineStrips2D(strips, colors=colours, radii=_BORDER_RADIUS_CELLS, draw_order=-4.0)
 
 

@@ -16,13 +16,12 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from cprl.runs.files import LOCK_FILE, RunLock, read_json, refuse_newer, write_json
+from cprl.runs.files import LOCK_FILE, RunLock, read_json, refuse_newer, time_now, write_json
 from cprl.runs.recipe import versions
 from cprl.system.output import say
 from cprl.web import messages
@@ -570,11 +569,6 @@ class Hall:
 def digest(secret: str) -> str:
     """Return the SHA-256 of a secret, the only form in which the session keeps it."""
     return hashlib.sha256(secret.encode(errors="replace")).hexdigest()
-
-
-def time_now() -> str:
-    """Return the time, as texts of the session hold it."""
-    return datetime.now().astimezone().isoformat(timespec="seconds")
 
 
 def _ms() -> int:

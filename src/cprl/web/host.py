@@ -10,6 +10,7 @@ from typing import Final
 from aiohttp import WSMsgType
 
 from cprl.system.output import say
+from cprl.values import build
 from cprl.web import messages
 from cprl.web.hall import Hall, JoinRefusedError, Outbox, Seat
 from cprl.web.serving import address_in_room, body_of, lasts, page_route, serving, web
@@ -29,7 +30,7 @@ def routes_of(hall: Hall) -> list[web.RouteDef]:
 
     async def join(request: web.Request) -> web.StreamResponse:
         try:
-            body = messages.Join.read(await body_of(request))
+            body = build(messages.Join, messages.read_object(await body_of(request)), "join")
             return web.json_response(hall.join(body.token, body.seat_token))
         except ValueError as error:
             return _refused(400, str(error))

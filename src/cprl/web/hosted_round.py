@@ -25,6 +25,7 @@ from cprl.evaluation.fresh import averages_of
 from cprl.experiment import Experiment
 from cprl.measuring.tracker import Episode, tracker_of
 from cprl.pictures.decoding import classes_seen
+from cprl.pictures.readable import instructions_of, options_of
 from cprl.population import AgentSpec, Person, has_people, partners_in
 from cprl.runs.episodes import append_batch, batches_in, stored_episodes
 from cprl.runs.files import REPORT, write_atomically
@@ -36,7 +37,7 @@ from cprl.values.array_types import Bool, Int64
 from cprl.web.hosting import TRAINED
 from cprl.web.messages import SIGNS
 from cprl.web.scenes import moment_json, scene_json, window_colours
-from cprl.web.session import HostedSession, instructions_of, options_of
+from cprl.web.session import HostedSession
 
 NONE: Final = -1
 """What stands for no action, or no vote: a script, or chance, decides."""

@@ -52,7 +52,7 @@ From the server come:
 
 import json
 from dataclasses import dataclass
-from typing import Any, Final, Literal, Self, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
 from cprl.commons.cells import APPLE, BEAM, CLEANING, GROUND, OTHER, SELF, WALL, WASTE, WATER
 from cprl.values import Natural, Value, build, short_repr
@@ -80,11 +80,6 @@ class Join(Value, stored=False):
 
     token: str
     seat_token: str | None = None
-
-    @classmethod
-    def read(cls, text: object) -> Self:
-        """Read the body of a request; raise a ValueError for any other text."""
-        return build(cls, read_object(text), "join")
 
 
 @dataclass(frozen=True)

@@ -145,7 +145,7 @@ class Sandbox:
 
     def __init__(self, folder: Path | None = None, *, episodes: int = SANDBOX_EPISODES) -> None:
         self._temporary = TemporaryDirectory()
-        self.folder = Path(self._temporary.name) if folder is None else folder
+        self.folder = folder or Path(self._temporary.name)
         self.episodes = checked("episodes", episodes, Positive)
         self._changing = Lock()
         """Guards the training."""

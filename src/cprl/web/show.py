@@ -156,14 +156,13 @@ def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, 
     `data` is what changes from turn to turn: JSON, compressed by zlib and encoded in base64.
     """
     game = commons_game(fresh.run)
-    violated = played.since_the_start("next", *keys.VIOLATED) > 0
     moments = [
         {
             "harvest": world.harvested.tolist(),
             "stock": int(world.stock.sum()),
             "board": moment_json(game.map, world, broken),
         }
-        for world, broken in zip(played.boards, violated, strict=True)
+        for world, broken in zip(played.boards, played.violated, strict=True)
     ]
     shares = equality(np.stack([world.harvested for world in played.boards]))
     changing = {
