@@ -28,13 +28,14 @@ from cprl.pictures.colours import PALETTE, agent_colour
 from cprl.pictures.readable import rules_of
 from cprl.policies.actors import random_agents
 from cprl.runs.episodes import EpisodeTable
+from cprl.runs.recipe import recipe_table
 from cprl.training import Schedule, train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.frames import FrameSchedule, Wall
 from cprl.viewer.header import CompilingNotice, Header, fresh_result
 from cprl.viewer.layout import layout
 from cprl.viewer.live import LiveStream, Stream
-from cprl.viewer.logger import RerunLogger, recipe_table, send_buffer
+from cprl.viewer.logger import RerunLogger, send_buffer
 from cprl.viewer.pictures import Pictures, Samples, visit_maps
 from cprl.viewer.scene import Curves, Panels, plotted_numbers, scene_of
 from cprl.viewer.view import Plots

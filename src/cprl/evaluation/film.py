@@ -204,10 +204,7 @@ def film_video(
     if path.suffix not in FILM_SUFFIXES:
         raise refusal("out", str(path), f"a file whose name ends in {' or '.join(FILM_SUFFIXES)}")
     runs = (run, *beside)
-    most_runs = LARGEST_WIDTH // SMALLEST_WIDTH
-    if len(runs) > most_runs:
-        raise refusal("beside", f"{len(runs) - 1} runs", f"at most {most_runs - 1}")
-    check_titles(style.titles, len(runs))
+    check_beside(runs, style.titles, most=LARGEST_WIDTH // SMALLEST_WIDTH)
     width = style.width_of_each(len(runs))
     refuse_to_write_over(path)
     if path.suffix == ".mp4":
@@ -240,10 +237,12 @@ def film_video(
     return path, tuple(panel.played.episode for panel in panels)
 
 
-def check_titles(titles: Sequence[str], runs: int) -> None:
-    """Refuse titles unless they are one printable line for each run; no titles are allowed too."""
-    if titles and (len(titles) != runs or not all(map(str.isprintable, titles))):
-        raise refusal("titles", titles, f"a line of text for each of {runs} runs")
+def check_beside(runs: Sequence[str | Path], titles: Sequence[str], *, most: int) -> None:
+    """Refuse more than `most` runs, and titles, if there are any, unless each run has a printable line."""
+    if len(runs) > most:
+        raise refusal("beside", f"{len(runs) - 1} runs", f"at most {most - 1}")
+    if titles and (len(titles) != len(runs) or not all(map(str.isprintable, titles))):
+        raise refusal("titles", titles, f"a line of text for each of {len(runs)} runs")
 
 
 def titles_of(fresh: Sequence[FreshEpisode]) -> Sequence[str]:

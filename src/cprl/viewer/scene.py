@@ -177,7 +177,7 @@ def scene_of(
         **{field.name: getattr(curves, field.name) for field in fields(Curves)},
         height=height,
         width=width,
-        walls=(*board.walls, *map(tuple, np.argwhere(beyond).tolist())),
+        walls=(*board.walls, *((row, col) for row, col in np.argwhere(beyond).tolist())),
         sites=board.sites,
         window=env.game.observation_shape[1:],
         caption=_caption(env.game),

@@ -23,6 +23,8 @@ from cprl.commons.game import Game
 from cprl.envs.commons_env import CommonsEnv
 from cprl.evaluation.fresh import averages_of
 from cprl.experiment import Experiment
+from cprl.measuring.registry import COLLECTIVE_RETURN
+from cprl.measuring.statistics import estimate_if_finite
 from cprl.measuring.tracker import Episode, tracker_of
 from cprl.pictures.decoding import classes_seen
 from cprl.pictures.readable import instructions_of, options_of
@@ -390,12 +392,19 @@ class HostedRound:
             "ended": "no apple was left" if episode.terminated else "time was up",
         }
 
-    def trained(self) -> dict[str, float] | None:
-        """Return the average harvest of an agent, and the turns, of trained agents that played this very
-        game; None without them."""
+    def trained(self) -> dict[str, Any] | None:
+        """Return the harvest of an agent, and the turns, of trained agents that played this very game.
+
+        They are means over replicas; of several replicas also their intervals. None without such agents.
+        """
         runs = [run for run in self._runs if run.game == self.game and not has_people(run.specs)]
         averages = averages_of(runs[0]) if runs else {}
         if not averages:
             return None
-        turns, apples = np.median([*averages.values()], axis=0).tolist()
-        return {"harvest": apples / self.game.agents, "survival_steps": turns}
+        turns, apples = np.transpose([*averages.values()])
+        trained: dict[str, Any] = {}
+        for name, values in (("harvest", apples / self.game.agents), ("survival_steps", turns)):
+            mean = estimate_if_finite(values.tolist()).of(COLLECTIVE_RETURN)
+            trained[name] = mean.value
+            trained[f"{name}_interval"] = mean.interval if len(values) > 1 else None
+        return trained

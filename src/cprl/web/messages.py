@@ -46,7 +46,8 @@ From the server come:
     vote       result: the title and the value in force of each ballot
     round_end  round, harvest, income, survival_steps, ended (in words)
     end        completion_code, names, rounds: of each rule, harvest, income, survival_steps, ended, and
-               trained (harvest of an agent and survival_steps on average, or null)
+               trained (harvest of an agent and survival_steps, means over replicas, and harvest_interval and
+               survival_steps_interval, [low, high] or null for a single replica; or null)
     error      why: the message was no JSON, too large, unknown, too early or not allowed; nothing has changed
 """
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from cprl import keys
 from cprl.commons.game import Game
-from cprl.evaluation.film import check_titles, titles_of
+from cprl.evaluation.film import check_beside, titles_of
 from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episodes, print_descriptions, record
 from cprl.evaluation.populations import commons_game
 from cprl.measuring.social import equality
@@ -66,9 +66,7 @@ def show(
         FileExistsError: if the page exists.
     """
     runs = (run, *beside)
-    if len(runs) > _MOST_RUNS:
-        raise refusal("beside", f"{len(runs) - 1} runs", f"at most {_MOST_RUNS - 1}")
-    check_titles(tuple(titles), len(runs))
+    check_beside(runs, tuple(titles), most=_MOST_RUNS)
     if out is not None:
         Page(out).refuse()
     fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)

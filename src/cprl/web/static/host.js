@@ -446,8 +446,12 @@ function resultTable(parent, rounds) {
   row("all together", rounds.map(({harvest}) => number(harvest.reduce((all, one) => all + one, 0))), "sum");
   row("turns that the board lasted", rounds.map((round) => number(round.survival_steps)));
   if (!rounds.some((round) => round.trained)) return;
-  const trained = (name, digits) => rounds.map((round) =>
-    round.trained ? number(Number(round.trained[name].toFixed(digits))) : "–");
+  const trained = (name, digits) => rounds.map((round) => {
+    if (!round.trained) return "–";
+    const rounded = (value) => number(Number(value.toFixed(digits)));
+    const interval = round.trained[`${name}_interval`];
+    return rounded(round.trained[name]) + (interval ? ` [${interval.map(rounded).join(", ")}]` : "");
+  });
   row("trained agents: each, on average", trained("harvest", 1), "sum");
   row("trained agents: turns, on average", trained("survival_steps", 0));
 }
