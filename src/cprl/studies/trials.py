@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 from cprl.experiment import Experiment
-from cprl.experiment.engine import engine_of
 from cprl.population import Frozen, partners_in, with_stored
 from cprl.runs.checkpoints import endings_of
 from cprl.runs.files import (
@@ -87,7 +86,7 @@ class Trial:
             seed=self.block.seed,
             replicas=self.block.replicas,
             agents=agents,
-            engine=engine_of(experiment),
+            engine=self.condition.engine,
         )
 
     @cached_property
