@@ -235,6 +235,7 @@ class Hall:
         if {file.name for file in self.folder.iterdir()} - {LOCK_FILE, LINK_FILE}:
             raise FileExistsError(f"{self.folder} is not empty; allowed: a new folder, or that of a session")
         self.token = secrets.token_urlsafe(16)
+        link.unlink(missing_ok=True)
         link.touch(mode=0o600)
         link.write_text(self.token, encoding="ascii")
         self._table = {
