@@ -106,7 +106,7 @@ def test_a_model_is_shown_the_rules_and_all_that_its_agent_observes():
         spec = language(server.url, every_steps=5, instructions="You never lie.")
         actions = played(game, actor_for(game, spec))
     system = server.requests[0]["messages"][0]["content"]
-    assert system.startswith("You never lie.\nYou are one of 2 agents on a board. Agents pick apples.")
+    assert system.startswith("You never lie.\nYou are one of 2 agents on a board.\nAgents pick apples.")
     assert "Each agent may pick at most" in system
     assert '"signal": 0 to 2' in system
     assert '- "sustainable": as greedy' in system

@@ -20,7 +20,7 @@ from cprl.commons.cells import class_name
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.pictures.decoding import SIGNS, window_text
-from cprl.pictures.readable import sentences_of
+from cprl.pictures.readable import instructions_of
 from cprl.policies.actors import LaneActor
 from cprl.policies.asking import Calls, Model, Question, Text
 from cprl.policies.rng import Purpose, seed_of
@@ -88,8 +88,8 @@ class _BoardPlans:
         signals = f', "signal": 0 to {rules.signals}, which others see' * bool(rules.signals)
         return "\n".join(
             [
-                f"You are one of {self.game.agents} agents on a board. {' '.join(sentences_of(self.game))}",
-                f"An episode has {rules.episode_steps:,} turns at most; it ends earlier if no apple is left.",
+                f"You are one of {self.game.agents} agents on a board.",
+                *instructions_of(self.game, "window"),
                 "Each apple that you pick is a point for you.",
                 f"Every {spec.every_steps} turns you choose a plan, which is played for you. Answer with one",
                 "JSON object and nothing else:",

@@ -4,7 +4,6 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -25,7 +24,7 @@ from cprl.policies.asking import CALLS
 from cprl.population import exploration_steps, partners_in
 from cprl.runs.checkpoints import CHECKPOINTS, Checkpointer, endings_of
 from cprl.runs.episodes import EpisodeTable
-from cprl.runs.files import LOCK_FILE, REPORT, RunLockedError, refuse_missing, write_json
+from cprl.runs.files import LOCK_FILE, REPORT, RunLockedError, refuse_missing, time_now, write_json
 from cprl.runs.length import Length
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
 from cprl.runs.recipe import (
@@ -479,7 +478,7 @@ def _write_report(directory: Path, training: Training, times: Times) -> None:
     report: dict[str, Any] = {
         **times.report(training.times),
         "steps": training.steps,
-        "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "finished": time_now(),
         "episodes": episodes,
         "worlds": training.schedule.worlds,
         "threads": torch.get_num_threads(),

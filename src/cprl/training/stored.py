@@ -1,11 +1,11 @@
-"""Stored agents of earlier runs, read by `load`, and their policies."""
+"""Stored agents of earlier runs, read by `load`, their policies, and checks that runs have the same game."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.env_state import load_transforms_state
-from cprl.envs.make_env import make_env, spaces_of
+from cprl.envs.make_env import make_env, spaces_of, stored_game
 from cprl.experiment import Experiment
 from cprl.networks.agent import acting_network
 from cprl.networks.finite import all_finite
@@ -34,7 +34,10 @@ from cprl.runs.checkpoints import CHECKPOINTS
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, warn_of_changes
 from cprl.runs.weights import frozen_weights_name, weights_in
-from cprl.values import Custom, instantiate, short_repr
+from cprl.values import Custom, describe_changes, instantiate, short_repr, to_config
+
+_MOST_DIFFERENCES: Final = 3
+"""The largest number of differences between two games that a message lists."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -226,6 +229,56 @@ def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
     with torch.random.fork_rng(devices=[]):  # new networks draw initial weights, which are replaced
         networks |= _networks(loaded, kept_weights.networks)
     return loaded
+
+
+def as_loaded(run: str | Path | LoadedRun) -> LoadedRun:
+    """Return a run as it is, or load it from its directory."""
+    return run if isinstance(run, LoadedRun) else load(run)
+
+
+def refuse_other_games(runs: Mapping[str, LoadedRun]) -> None:
+    """Raise a ValueError if a run has a different game or different transforms than the first run.
+
+    Args:
+        runs: the runs by the names that a refusal says.
+    """
+    first_name, *other_names = runs
+    first_run = runs[first_name]
+    for name in other_names:
+        run = runs[name]
+        both = f"{first_name} and {name}"
+        refuse_unlike(both, first_run.experiment.game, run.experiment.game)
+        refuse_unlike(both, first_run.experiment.transforms, run.experiment.transforms, "transforms")
+        learned = differing_entries(first_run.transforms_state, run.transforms_state)
+        if learned:
+            raise ValueError(f"{both}: the learned state of transforms differs: {learned}")
+
+
+def differing_entries(state: Mapping[str, Any], other_state: Mapping[str, Any]) -> list[str]:
+    """Return the names of the entries of a transforms' state that another state lacks or has with another
+    value."""
+    return [
+        name
+        for name, value in state.items()
+        if name not in other_state
+        or not torch.equal(torch.as_tensor(value), torch.as_tensor(other_state[name]))
+    ]
+
+
+def refuse_unlike(names: str, game: Any, other_game: Any, path: str = "") -> None:
+    """Raise a ValueError that says where two games, or two lists of transforms, differ.
+
+    Args:
+        names: the names of the two runs, e.g. "a and b".
+        path: where the differences are; by default the game's class.
+    """
+    config = to_config(stored_game(game))
+    other_config = to_config(stored_game(other_game))
+    lines = describe_changes(config, other_config, path or type(game).__name__)
+    if lines:
+        raise ValueError(
+            f"{names} have different games: {'; '.join(lines[:_MOST_DIFFERENCES])}; allowed: the same game"
+        )
 
 
 def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module]:
