@@ -18,6 +18,7 @@ REQUIRED = {
     "EarlierGame": lambda: cprl.EarlierGame(game=GAME, steps=100),
     "Learning": lambda: LEARNING,
     "Team": lambda: population.Team(algorithms.VDN(settings=algorithms.DQNSettings()), agents=(0, 1)),
+    "Language": lambda: population.Language(model="small"),
     "Frozen": lambda: population.Frozen("runs/none", agent=0),
     "RandomEnd": lambda: cprl.RandomEnd(prob=0.15),
     "InequityAversion": lambda: rewards.InequityAversion(alpha=5, beta=0.05, smoothing=0.9),

@@ -32,7 +32,7 @@ class _Assignment:
     agents: int | list[int]
     """The agents, as the axis of agents is indexed: an index removes the axis, a list keeps it."""
     in_keys: tuple[str, ...]
-    """The entries of "agents" that the actor reads, in the order of its arguments."""
+    """The entries of "agents", and "done", that the actor reads, in the order of its arguments."""
     state_cells: int
     """The numbers in an agent's recurrent state; 0 for an actor without one."""
     worlds: int
@@ -127,12 +127,12 @@ class JointPolicy(TensorDictModuleBase):
             recurrent_state.prepare(agents, (*shape, self._state_cells), observation.device)
         if self._one_actor_plays_all:  # reads and writes whole entries, without indexing or copying them
             (assignment,) = self._assignments
-            keys.put(agents, "action", _choose(assignment, agents, (), tensordict.batch_size))
+            keys.put(agents, "action", _choose(assignment, agents, (), tensordict))
             return tensordict
         actions = observation.new_empty(shape, dtype=torch.int64)
         for assignment in self._assignments:
             index = (*[slice(None)] * batch_dims, assignment.agents)
-            actions[index] = _choose(assignment, agents, index, tensordict.batch_size)
+            actions[index] = _choose(assignment, agents, index, tensordict)
         agents.set("action", actions)
         return tensordict
 
@@ -153,21 +153,27 @@ class JointPolicy(TensorDictModuleBase):
 
 
 def _choose(
-    assignment: _Assignment, agents: TensorDictBase, index: tuple[Any, ...], batch_size: torch.Size
+    assignment: _Assignment, agents: TensorDictBase, index: tuple[Any, ...], worlds: TensorDictBase
 ) -> Tensor:
     """Return the actions that an actor chooses for its agents; write their recurrent states, if it has any.
 
     Args:
         agents: the entries of "agents", [B, N, ...].
         index: selects the actor's agents in these entries; () selects all.
+        worlds: the entries of worlds, [B], of which an actor may read "done".
     """
     actor = assignment.actor
     names = assignment.in_keys
-    inputs = [_read_entry(agents, name, index, assignment.state_cells) for name in names]
+    inputs = [
+        keys.entry(worlds, name)
+        if name == keys.DONE
+        else _read_entry(agents, name, index, assignment.state_cells)
+        for name in names
+    ]
     if isinstance(actor, LaneActor):  # the same as its forward, without the cost of a TensorDict
         action, *states_after = actor.choose_with(*inputs)
     else:
-        output = actor(unchecked_tensordict(dict(zip(names, inputs, strict=True)), batch_size))
+        output = actor(unchecked_tensordict(dict(zip(names, inputs, strict=True)), worlds.batch_size))
         action = output.get("action")
         states_after = [output.get(recurrent_state.AFTER)] if assignment.state_cells else []
     for states in states_after:

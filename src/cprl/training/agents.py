@@ -1,6 +1,7 @@
 """Population: the agents of an experiment that learn, follow a script, or were trained by an earlier run."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, get_args
 
@@ -21,15 +22,18 @@ from cprl.networks.agent import acting_network
 from cprl.networks.recurrent import state_shape_of
 from cprl.objectives.rewards import reward_name
 from cprl.policies.actors import random_agents
+from cprl.policies.asking import Calls
 from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
 from cprl.policies.governors import governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
+from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import RULES_READ, ScriptedActor
 from cprl.population import (
     AgentSpec,
     Frozen,
     GovernorSpec,
+    Language,
     Learning,
     Scripted,
     Team,
@@ -44,6 +48,7 @@ from cprl.training.stored import (
     LoadedRun,
     StoredAgent,
     decision_values,
+    language_agent,
     load,
     stored_actors,
     trained_agent,
@@ -111,6 +116,8 @@ class Population:
         self._specs_by_agent = specs_by_agent(specs, self.spaces.agents)
         check_scripted(groups, self.spaces, self._game)
         self._replica_numbers = range(first_replica, first_replica + self.replicas)
+        self.calls = Calls()
+        """The calls of the agents' language models."""
         self._stored_agents = self._load_stored_agents(weights or {})
         self.learners: dict[tuple[int, ...], AnyLearner] = {}
         for spec, agents in groups:
@@ -209,12 +216,15 @@ class Population:
         for agent, spec in enumerate(self._specs_by_agent):
             if isinstance(spec, Scripted):
                 agents[agent] = [StoredAgent(scripted=spec.policy)] * self.replicas
+            elif isinstance(spec, Language):
+                agents[agent] = [language_agent(spec, self.calls)] * self.replicas
             elif isinstance(spec, Frozen):
                 if spec.run not in runs:
                     runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
                     _refuse_other_game(runs[spec.run], self.spaces, self._game, is_to_decide=True)
                 replicas = map(spec.replica_for, self._replica_numbers)
-                agents[agent] = [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
+                stored = [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
+                agents[agent] = [replace(one, calls=self.calls) for one in stored]
         return agents
 
     def other_actors(
@@ -229,6 +239,8 @@ class Population:
         """
         numbers = self._replica_numbers[:replicas]
         agents = {agent: stored[: len(numbers)] for agent, stored in self._stored_agents.items()}
+        if purpose is Purpose.EXHIBITION:  # viewers cost no calls
+            agents = {agent: list(map(_without_language, stored)) for agent, stored in agents.items()}
         kinds = {
             agent: (getattr(self._specs_by_agent[agent], "run", None), stored[0].kind)
             for agent, stored in agents.items()
@@ -300,6 +312,10 @@ class Population:
         return weights
 
 
+def _without_language(agent: StoredAgent) -> StoredAgent:
+    return replace(agent, language=None)
+
+
 def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game: Game | None) -> None:
     """Refuse transforms that change the windows which scripted policies read.
 
@@ -311,7 +327,7 @@ def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game
     if game is None or spaces == game.spaces:
         return
     for spec, agents in groups:
-        if isinstance(spec, Scripted) and spec.policy != "random":
+        if isinstance(spec, Language) or (isinstance(spec, Scripted) and spec.policy != "random"):
             raise ValueError(
                 f"agents {list(agents)} follow {spec}, which reads the window of the game; transforms make "
                 f"it {spaces.observation_dtype} {list(spaces.observation_shape)}: leave those transforms "
@@ -336,6 +352,8 @@ def refuse_other_worlds(earlier: EnvBase, env: EnvBase, name: str, others: Itera
         pairs["ballots"] = _ballot_choices(games[0]), _ballot_choices(games[1])
         pairs["a governor:"] = games[0].governor, games[1].governor
         for actor in others:
+            if isinstance(actor, LanguageActor):
+                pairs["for a language model the game"] = games[0], games[1]
             if isinstance(actor, ScriptedActor):
                 for rule in RULES_READ[actor.policy]:
                     values = getattr(games[0].rules, rule), getattr(games[1].rules, rule)

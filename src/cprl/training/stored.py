@@ -1,11 +1,11 @@
-"""Stored agents of earlier runs, read by `load`, and their policies."""
+"""Stored agents of earlier runs, read by `load`, their policies, and checks that runs have the same game."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -16,22 +16,25 @@ from torchrl.envs import EnvBase
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.env_state import load_transforms_state
-from cprl.envs.make_env import make_env, spaces_of
+from cprl.envs.make_env import make_env, spaces_of, stored_game
 from cprl.experiment import Experiment
 from cprl.networks.agent import acting_network
 from cprl.networks.finite import all_finite
 from cprl.networks.recurrent import state_cells_of
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.actors import LaneActor
+from cprl.policies.asking import CALLS, Calls
 from cprl.policies.decisions import ballot_sizes, stored_decisions
 from cprl.policies.governors import GovernorActor, Script, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
+from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
 from cprl.population import (
     AgentSpec,
     Frozen,
     GovernorSpec,
+    Language,
     Learning,
     Person,
     Scripted,
@@ -42,7 +45,10 @@ from cprl.runs.checkpoints import CHECKPOINTS
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, warn_of_changes
 from cprl.runs.weights import frozen_weights_name, weights_in
-from cprl.values import Custom, instantiate, short_repr
+from cprl.values import Custom, describe_changes, instantiate, short_repr, to_config
+
+_MOST_DIFFERENCES: Final = 3
+"""The largest number of differences between two games that a message lists."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -51,6 +57,10 @@ class StoredAgent:
 
     scripted: ScriptedPolicy | Script | None = None
     """The policy that it follows; None for an agent that acts by a network."""
+    language: Language | None = None
+    """How a language model makes its plans, where it falls back to `scripted`; None without one."""
+    calls: Calls | None = field(default=None, repr=False)
+    """What keeps the calls of its model."""
     network: nn.Module | None = field(default=None, repr=False)
     stochastic: bool = False
     """True if the network outputs the logits of a policy; else it outputs action values."""
@@ -65,7 +75,7 @@ class StoredAgent:
     @property
     def kind(self) -> tuple[Any, ...]:
         """Return the kind of the agent; agents of one kind can be lanes of one actor."""
-        return self.scripted, self.stochastic, self.epsilon, self.algorithm
+        return self.scripted, self.language, self.stochastic, self.epsilon, self.algorithm
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -118,6 +128,13 @@ class LoadedRun:
         """Return the observations and actions of its agents, transforms included."""
         return spaces_of(self.env())
 
+    @cached_property
+    def calls(self) -> Calls:
+        """Return what keeps the calls of its language models, in its directory."""
+        calls = Calls()
+        calls.keep_in(self.path / CALLS)
+        return calls
+
     @property
     def playing(self) -> Game | Spaces:
         """Return what policies are made for: the game, or its spaces if it is not a game of cprl."""
@@ -151,6 +168,8 @@ class LoadedRun:
             return StoredAgent(scripted=spec)
         if isinstance(spec, Scripted):
             return StoredAgent(scripted=spec.policy)
+        if isinstance(spec, Language):
+            return language_agent(spec, self.calls)
         if isinstance(spec, Person):
             raise ValueError(
                 f"agent {agent} of {self.path} is a person: people cannot be played again; allowed: cprl "
@@ -199,6 +218,11 @@ class LoadedRun:
         return read_episodes(self.path)
 
 
+def language_agent(spec: Language, calls: Calls) -> StoredAgent:
+    """Return an agent for which a language model makes plans, and whose calls are kept."""
+    return StoredAgent(scripted=spec.fallback, language=spec, calls=calls)
+
+
 def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
     """Load a run from its directory, without running code that it holds.
 
@@ -235,6 +259,56 @@ def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
     with torch.random.fork_rng(devices=[]):  # new networks draw initial weights, which are replaced
         networks |= _networks(loaded, kept_weights.networks)
     return loaded
+
+
+def as_loaded(run: str | Path | LoadedRun) -> LoadedRun:
+    """Return a run as it is, or load it from its directory."""
+    return run if isinstance(run, LoadedRun) else load(run)
+
+
+def refuse_other_games(runs: Mapping[str, LoadedRun]) -> None:
+    """Raise a ValueError if a run has a different game or different transforms than the first run.
+
+    Args:
+        runs: the runs by the names that a refusal says.
+    """
+    first_name, *other_names = runs
+    first_run = runs[first_name]
+    for name in other_names:
+        run = runs[name]
+        both = f"{first_name} and {name}"
+        refuse_unlike(both, first_run.experiment.game, run.experiment.game)
+        refuse_unlike(both, first_run.experiment.transforms, run.experiment.transforms, "transforms")
+        learned = differing_entries(first_run.transforms_state, run.transforms_state)
+        if learned:
+            raise ValueError(f"{both}: the learned state of transforms differs: {learned}")
+
+
+def differing_entries(state: Mapping[str, Any], other_state: Mapping[str, Any]) -> list[str]:
+    """Return the names of the entries of a transforms' state that another state lacks or has with another
+    value."""
+    return [
+        name
+        for name, value in state.items()
+        if name not in other_state
+        or not torch.equal(torch.as_tensor(value), torch.as_tensor(other_state[name]))
+    ]
+
+
+def refuse_unlike(names: str, game: Any, other_game: Any, path: str = "") -> None:
+    """Raise a ValueError that says where two games, or two lists of transforms, differ.
+
+    Args:
+        names: the names of the two runs, e.g. "a and b".
+        path: where the differences are; by default the game's class.
+    """
+    config = to_config(stored_game(game))
+    other_config = to_config(stored_game(other_game))
+    lines = describe_changes(config, other_config, path or type(game).__name__)
+    if lines:
+        raise ValueError(
+            f"{names} have different games: {'; '.join(lines[:_MOST_DIFFERENCES])}; allowed: the same game"
+        )
 
 
 def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module]:
@@ -380,6 +454,9 @@ def stored_actors(
         lanes = list(chain.from_iterable(by_replica))
         size: dict[str, Any] = {"seeds": seeds(agents=indices), "agents": len(indices), "worlds": worlds}
         stored = lanes[0]
+        if stored.language is not None and stored.calls is not None:
+            actors[tuple(indices)] = LanguageActor(stored.language, playing, calls=stored.calls, **size)
+            continue
         if stored.scripted is not None:
             actors[tuple(indices)] = scripted_lanes(stored.scripted, playing, **size)
             continue
