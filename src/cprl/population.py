@@ -1,5 +1,5 @@
-"""Specifications of agents: `Learning`, `Team`, `Scripted`, `Frozen` and `Person`, the values that an
-experiment's `agents` holds.
+"""Specifications of agents: `Learning`, `Team`, `Scripted`, `Language`, `Frozen` and `Person`, the values
+that an experiment's `agents` holds.
 
 A population is a sequence of specifications. A `Team` stands once and names its agents; the other
 specifications stand for one agent each and take the remaining agent indices in order.
@@ -15,6 +15,8 @@ from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.learners.settings import EpsilonGreedy
 from cprl.objectives.rewards import Reward
 from cprl.policies.decisions import Bandit
+from cprl.policies.governors import Script
+from cprl.policies.language import Language as Language
 from cprl.policies.scripted import ScriptedPolicy
 from cprl.values import AgentIndices, Custom, Natural, Value, Where, checked
 
@@ -156,8 +158,10 @@ class Person(Value):
     played; it cannot be trained, nor its people played again."""
 
 
-AgentSpec: TypeAlias = Learning | Team | Scripted | Frozen | Person
+AgentSpec: TypeAlias = Learning | Team | Scripted | Language | Frozen | Person
 """The specification of an agent, or of a team."""
+GovernorSpec: TypeAlias = Learning | Frozen | Script
+"""The specification of a governor. A `Frozen` one counts as the agent after the last of its run."""
 
 
 def any_learns(specs: Sequence[AgentSpec]) -> bool:
@@ -175,7 +179,7 @@ def refuse_people(specs: Sequence[AgentSpec]) -> None:
     if has_people(specs):
         raise ValueError(
             f"agents[{specs.index(Person())}] is a Person, and people play in hosted games: cprl host; "
-            "allowed: Learning, Team, Scripted, Frozen"
+            "allowed: Learning, Team, Scripted, Language, Frozen"
         )
 
 
@@ -208,6 +212,8 @@ def _describe(spec: AgentSpec) -> str:
             return f"by {name}{team}"
         case Scripted():
             return f"by the script {spec.policy!r}"
+        case Language():
+            return f"by the language model {spec.model}"
         case Frozen():
             return "of an earlier run"
         case Person():
@@ -290,7 +296,7 @@ def exploring(specs: Sequence[AgentSpec]) -> list[EpsilonGreedy]:
     return [algorithm.settings for algorithm in greedy if isinstance(algorithm.settings, EpsilonGreedy)]
 
 
-def partners_in(specs: Iterable[AgentSpec]) -> list[str]:
+def partners_in(specs: Iterable[Any]) -> list[str]:
     """Return the directories of the earlier runs whose frozen agents play in a population, sorted."""
     return sorted({spec.run for spec in specs if isinstance(spec, Frozen)})
 

@@ -212,13 +212,15 @@ def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") ->
     return dict(recipe["experiment"])
 
 
-STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)(\.start_from)?\.run")
-"""The path of a study's factor that is the run of a `Frozen` agent."""
+STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)\.((start_from\.)?run|stored)")
+"""The path of a study's factor that is a run."""
+_RUN_FIELDS: Final = {"Frozen": {"run"}, "Language": {"stored"}}
+"""The fields that hold the path of a run, by kind."""
 
 
 def with_runs_moved(table: Any, start: str | Path, end: str | Path, *, is_run: bool = False) -> Any:
-    """Return a table, of an experiment or of values by path, in which the runs of `Frozen` agents are
-    relative to `end` instead of `start`. An argument "run" of user code stays."""
+    """Return a table, of an experiment or of values by path, in which the runs of its agents are relative to
+    `end` instead of `start`. An argument "run" of user code stays."""
     if isinstance(table, str) and is_run and not os.path.isabs(table):
         return os.path.relpath(os.path.join(start, table), end)
     if isinstance(table, list):
@@ -226,7 +228,7 @@ def with_runs_moved(table: Any, start: str | Path, end: str | Path, *, is_run: b
     if not isinstance(table, Mapping) or table.get("kind") == "Custom":
         return table
     names = {name for name in table if is_run or STORED_RUN.fullmatch(name)}
-    names |= {"run"} if table.get("kind") == "Frozen" else set()
+    names |= _RUN_FIELDS.get(str(table.get("kind")), set())
     return {name: with_runs_moved(entry, start, end, is_run=name in names) for name, entry in table.items()}
 
 

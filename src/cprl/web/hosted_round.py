@@ -26,7 +26,7 @@ from cprl.experiment import Experiment
 from cprl.measuring.registry import COLLECTIVE_RETURN
 from cprl.measuring.statistics import estimate_if_finite
 from cprl.measuring.tracker import Episode, tracker_of
-from cprl.pictures.decoding import classes_seen
+from cprl.pictures.decoding import classes_seen, window_text
 from cprl.pictures.readable import instructions_of, options_of
 from cprl.population import AgentSpec, Person, has_people, partners_in
 from cprl.runs.episodes import append_batch, batches_in, stored_episodes
@@ -37,7 +37,6 @@ from cprl.training.agents import Population
 from cprl.training.stored import LoadedRun
 from cprl.values.array_types import Bool, Int64
 from cprl.web.hosting import TRAINED
-from cprl.web.messages import SIGNS
 from cprl.web.scenes import moment_json, scene_json, window_colours
 from cprl.web.session import HostedSession
 
@@ -390,11 +389,10 @@ class HostedRound:
         observation = self._moment[keys.OBSERVATION].numpy()[group, agent]
         if view == "array":
             return {"observation": b64encode(observation.tobytes()).decode()}
+        if view == "text":
+            return {"text": window_text(self.game, observation)}
         classes = classes_seen(self.game, observation[None, None])[0, 0]
-        if view == "window":
-            return {"window": b64encode(classes.tobytes()).decode()}
-        signs = np.vectorize(lambda kind: SIGNS.get(kind, "O"))(classes)
-        return {"text": "\n".join(map("".join, signs))}
+        return {"window": b64encode(classes.tobytes()).decode()}
 
     def result(self, group: int) -> dict[str, Any]:
         """Return how the round ended for a group, as messages say it."""

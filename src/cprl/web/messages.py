@@ -43,7 +43,7 @@ From the server come:
                               rule), beams
                  window       base64 of the classes of the cells that one sees, a byte a cell, row by row
                  observation  base64 of ("agents", "observation") of `CommonsEnv`, uint8 of observation_shape
-                 text         the window as lines of `SIGNS`
+                 text         the window as lines of `cprl.pictures.decoding.SIGNS`
     chat       from, text
     vote       result: the title and the value in force of each ballot
     round_end  round, harvest, income, survival_steps, ended (in words)
@@ -57,24 +57,11 @@ import json
 from dataclasses import dataclass
 from typing import Any, Final, Literal, TypeAlias
 
-from cprl.commons.cells import APPLE, BEAM, CLEANING, GROUND, OTHER, SELF, WALL, WASTE, WATER
 from cprl.values import Natural, Value, build, short_repr
 from cprl.web.hosting import ShortText
 
 MOST_BYTES: Final = 1024
 """The largest message that is read."""
-SIGNS: Final = {
-    GROUND: ".",
-    WALL: "#",
-    APPLE: "A",
-    BEAM: "*",
-    OTHER: "O",
-    SELF: "@",
-    WATER: "~",
-    WASTE: "H",
-    CLEANING: "*",
-}
-"""The sign of each class of cells in a window as text; other agents that can be told apart are `O` too."""
 
 
 @dataclass(frozen=True)
