@@ -15,6 +15,7 @@ from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.learners.settings import EpsilonGreedy
 from cprl.objectives.rewards import Reward
 from cprl.policies.decisions import Bandit
+from cprl.policies.governors import Script
 from cprl.policies.language import Language as Language
 from cprl.policies.scripted import ScriptedPolicy
 from cprl.values import AgentIndices, Custom, Natural, Value, Where, checked
@@ -159,6 +160,8 @@ class Person(Value):
 
 AgentSpec: TypeAlias = Learning | Team | Scripted | Language | Frozen | Person
 """The specification of an agent, or of a team."""
+GovernorSpec: TypeAlias = Learning | Frozen | Script
+"""The specification of a governor. A `Frozen` one counts as the agent after the last of its run."""
 
 
 def any_learns(specs: Sequence[AgentSpec]) -> bool:
@@ -293,7 +296,7 @@ def exploring(specs: Sequence[AgentSpec]) -> list[EpsilonGreedy]:
     return [algorithm.settings for algorithm in greedy if isinstance(algorithm.settings, EpsilonGreedy)]
 
 
-def partners_in(specs: Iterable[AgentSpec]) -> list[str]:
+def partners_in(specs: Iterable[Any]) -> list[str]:
     """Return the directories of the earlier runs whose frozen agents play in a population, sorted."""
     return sorted({spec.run for spec in specs if isinstance(spec, Frozen)})
 

@@ -77,6 +77,10 @@ class FreshGame:
         """Return the game or the spaces for which policies are made, as `LoadedRun.playing`."""
         return self.game if isinstance(self.game, Game) else spaces_of(self.env())
 
+    def governor(self, replicas: Sequence[int]) -> list[StoredAgent]:
+        """Return no governor: the first option of one in the game stays in force."""
+        return []
+
     def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase:
         """Return an environment with fresh worlds of the game."""
         return make_env(self.game, worlds=worlds, seed=seed, first_world=first_world)
@@ -155,7 +159,14 @@ def policies_of(
 ) -> JointPolicy:
     """Return the joint policy of all agents in the lanes of these replicas."""
     stored = [list(map(agent, replicas)) for agent in agents]
-    return stored_policies(stored, place.playing, replicas=replicas, worlds=fresh.episodes, seed=fresh.seed)
+    return stored_policies(
+        stored,
+        place.playing,
+        replicas=replicas,
+        worlds=fresh.episodes,
+        seed=fresh.seed,
+        governor=place.governor(replicas),
+    )
 
 
 def play_fresh(

@@ -17,6 +17,7 @@ from cprl.institutions import (
     Boundaries,
     ClosedPatches,
     ClosedSeason,
+    Governor,
     GraduatedSanctions,
     Institution,
     Levies,
@@ -185,6 +186,9 @@ def meaning_of(institution: Institution, game: Game) -> str:
             return text + _breach(institution.fine, game)
         case Vote():
             return _vote(institution, game)
+        case Governor(every_steps=every):
+            options = ", ".join(map(_number, institution.options))
+            return f"Every {_turns(every)} a governor sets {institution.decided.title}: one of {options}."
         case Tax():
             return _tax(institution)
         case Levies(groups=groups, local_rate=local, joint_rate=joint):

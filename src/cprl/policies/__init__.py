@@ -8,6 +8,7 @@ Modules, in the order in which one reads them:
     language        LanguageActor: agents for which a language model makes plans
     tabular         tables of action values, in which agents look actions up
     decisions       Decider: how agents vote and elect; Bandit: how they learn to
+    governors       how governors decide: StockRule, Constant, GovernorActor
     joint_policy    JointPolicy: the policy of all agents of a game, made of their actors
     recorded_policy RecordedPolicy: an episode that was played, action by action
     rng             names and seeds of lanes, and independent random numbers for each lane

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from cprl import keys, recurrent_state
 from cprl.policies.actors import LaneActor
 from cprl.policies.decisions import Decider
+from cprl.policies.governors import GovernorActor
 from cprl.system.compat.tensordicts import unchecked_tensordict
 
 ActorAgents: TypeAlias = int | tuple[int, ...]
@@ -57,11 +58,14 @@ class JointPolicy(TensorDictModuleBase):
             each controls: an index for an actor of one agent, a tuple for an actor of several, e.g. a
             `LaneActor`.
         decisions: chooses on the ballots of games that have any (`Game.decisions`); None in other games.
+        governor: decides in games with a `Governor`; None in other games, and where its first option stays in
+            force.
 
     Reads ("agents", "observation"), uint8 [B, N, C, X, Y], and the other entries of "agents" that an actor's
     `in_keys` name, e.g. "apple_ahead"; writes ("agents", "action"), int64 [B, N].
     With recurrent actors it also reads "recurrent_state", and writes that and "recurrent_state_before".
-    With decisions it also reads "ballots_due", and writes ("agents", "decision"), int64 [B, N].
+    With decisions it also reads "ballots_due", and writes ("agents", "decision"), int64 [B, N]; with a
+    governor "seen" and "rule".
     """
 
     in_keys: tuple[Any, ...] = (keys.OBSERVATION,)
@@ -72,6 +76,7 @@ class JointPolicy(TensorDictModuleBase):
         actors: Sequence[nn.Module] | Mapping[ActorAgents, nn.Module],
         *,
         decisions: Decider | None = None,
+        governor: GovernorActor | None = None,
     ) -> None:
         super().__init__()
         actors_by_agents = dict(actors.items() if isinstance(actors, Mapping) else enumerate(actors))
@@ -85,6 +90,7 @@ class JointPolicy(TensorDictModuleBase):
         """The agents of each actor, in the order of `actors`."""
         self.actors = nn.ModuleList(actors_by_agents.values())
         self.decisions = decisions
+        self.governor = governor
         self._assignments = [
             _Assignment.from_actor(actor, agents) for agents, actor in actors_by_agents.items()
         ]
@@ -101,6 +107,9 @@ class JointPolicy(TensorDictModuleBase):
                 )
             self.in_keys = (keys.OBSERVATION, keys.BALLOTS_DUE)
             self.out_keys = (keys.ACTION, keys.DECISION)
+        if governor is not None:
+            self.in_keys = (*self.in_keys, keys.SEEN)
+            self.out_keys = (*self.out_keys, keys.RULE)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         agents = keys.entry(tensordict, keys.AGENTS)
@@ -109,6 +118,8 @@ class JointPolicy(TensorDictModuleBase):
         if self.decisions is not None:
             ballots_due = keys.entry(tensordict, keys.BALLOTS_DUE)
             keys.put(agents, "decision", self.decisions.decide(ballots_due))
+        if self.governor is not None:
+            keys.put(tensordict, keys.RULE, self.governor.decide(keys.entry(tensordict, keys.SEEN)))
         observation = keys.entry(agents, "observation")
         self._refuse_other_agents(observation.shape[batch_dims])
         shape = observation.shape[: batch_dims + 1]

@@ -86,6 +86,7 @@ class Trial:
             seed=self.block.seed,
             replicas=self.block.replicas,
             agents=agents,
+            governor=with_stored(experiment.governor, in_block),
             engine=self.condition.engine,
         )
 
@@ -348,7 +349,7 @@ class Task:
         if state_of(run) != "missing":
             return None
         try:
-            start(run, experiment, partners_in(experiment.agents))
+            start(run, experiment, partners_in(experiment.specs))
         except FileExistsError:
             if state_of(run) == "missing" and not (run / LOCK_FILE).exists():
                 raise

@@ -24,6 +24,7 @@ from cprl.objectives.rewards import reward_name
 from cprl.policies.actors import random_agents
 from cprl.policies.asking import Calls
 from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
+from cprl.policies.governors import governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
@@ -31,6 +32,7 @@ from cprl.policies.scripted import RULES_READ, ScriptedActor
 from cprl.population import (
     AgentSpec,
     Frozen,
+    GovernorSpec,
     Language,
     Learning,
     Scripted,
@@ -41,6 +43,7 @@ from cprl.population import (
     refuse_undecided,
     specs_by_agent,
 )
+from cprl.training.governing import Governing
 from cprl.training.stored import (
     LoadedRun,
     StoredAgent,
@@ -76,6 +79,8 @@ class Population:
             weights is loaded next.
         weights: the names of the weights of `Frozen` agents by run, see `cprl.load`; runs not in it have
             their final ones.
+        governor: the specification of the governor; None leaves its first option in force.
+        governor_from_turn: the turns of the training before it decides.
     """
 
     def __init__(
@@ -89,6 +94,8 @@ class Population:
         engine: str = "compiled",
         starts: bool = True,
         weights: Mapping[str, str] | None = None,
+        governor: GovernorSpec | None = None,
+        governor_from_turn: int = 0,
     ) -> None:
         known = get_args(TrainingEngine)
         if engine not in known:
@@ -121,6 +128,8 @@ class Population:
         self.decisions: BanditDecider | None = self._make_decider()
         """The decisions of the agents on the game's ballots, and how they learn them; None without
         ballots."""
+        self.governor = self._make_governor(governor, governor_from_turn, weights or {})
+        """The governor, and how it learns; None without one."""
 
     @property
     def playing(self) -> Game | Spaces:
@@ -139,7 +148,8 @@ class Population:
             decisions = self.decisions.without_exploration(
                 Purpose.EVALUATED_DECISIONS, replicas=self.replicas, worlds=worlds
             )
-        return JointPolicy(actors, decisions=decisions)
+        governor = None if self.governor is None else self.governor.evaluation_actor(worlds)
+        return JointPolicy(actors, decisions=decisions, governor=governor)
 
     def random_policy(self, worlds: int) -> JointPolicy:
         """Return policies that take every action, and every choice of a decision, with equal probability."""
@@ -155,14 +165,34 @@ class Population:
             seed=self.seed,
             purpose=Purpose.RANDOM_PLAY,
         )
-        return JointPolicy(actors, decisions=decisions)
+        governor = None if self.governor is None else self.governor.random_actor(worlds)
+        return JointPolicy(actors, decisions=decisions, governor=governor)
 
     def networks(self) -> dict[str, nn.Module]:
         """Return copies of the learners' current acting networks, by "replica_0/agent_0" and so on."""
         networks: dict[str, nn.Module] = {}
         for learner in self.learners.values():
             networks |= learner.networks()
-        return networks
+        return networks if self.governor is None else networks | self.governor.networks()
+
+    def _make_governor(
+        self, spec: GovernorSpec | None, from_turn: int, weights: Mapping[str, str]
+    ) -> Governing | None:
+        """Return the governor, which counts as the agent after the last one; None without one."""
+        if spec is None:
+            return None
+        if self._game is None or self._game.governor is None:
+            raise ValueError(f"governor is {spec}; allowed in a game without a Governor: None")
+        lanes = Lanes(
+            governor_spaces(self._game),
+            agents=(self._game.agents,),
+            replicas=self.replicas,
+            worlds=self.worlds,
+            seed=self.seed,
+            first_replica=self._replica_numbers.start,
+            device=self.device,
+        )
+        return Governing(self._game, self._game.governor, spec, lanes, from_turn=from_turn, weights=weights)
 
     def as_stored(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
         """Return copies of the current agents of some replicas, by agent and replica."""
@@ -320,6 +350,7 @@ def refuse_other_worlds(earlier: EnvBase, env: EnvBase, name: str, others: Itera
     pairs |= _pairs(games[0], spaces_of(earlier), games[1], spaces_of(env))
     if games[0] is not None and games[1] is not None:
         pairs["ballots"] = _ballot_choices(games[0]), _ballot_choices(games[1])
+        pairs["a governor:"] = games[0].governor, games[1].governor
         for actor in others:
             if isinstance(actor, LanguageActor):
                 pairs["for a language model the game"] = games[0], games[1]

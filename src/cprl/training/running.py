@@ -196,7 +196,7 @@ def _open_run(
     experiment = _with_engine(requested, resumed)
     state, _, step = _find_next_step(out, experiment, resume=resume)
     with working("making agents"):
-        partners = partners_in(experiment.agents)
+        partners = partners_in(experiment.specs)
         weights = {} if resumed is None else frozen_weights_names(resumed, partners)
         env, population = make_agents(experiment, starts=state in ("missing", "begun"), weights=weights)
         earlier = make_earlier(experiment, env, population)
@@ -389,6 +389,7 @@ class _Stages:
                     run.experiment.schedule,
                     others=run.population.others,
                     decisions=run.population.decisions,
+                    governor=run.population.governor,
                     callbacks=[evaluations, table, progress_bar, *run.observers, *viewers, *loggers],
                     metrics=run.experiment.metrics,
                     earlier=run.earlier,

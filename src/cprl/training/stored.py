@@ -25,11 +25,22 @@ from cprl.networks.stacked import stack_lanes
 from cprl.policies.actors import LaneActor
 from cprl.policies.asking import CALLS, Calls
 from cprl.policies.decisions import ballot_sizes, stored_decisions
+from cprl.policies.governors import GovernorActor, Script, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
-from cprl.population import AgentSpec, Frozen, Language, Learning, Person, Scripted, Team, specs_by_agent
+from cprl.population import (
+    AgentSpec,
+    Frozen,
+    GovernorSpec,
+    Language,
+    Learning,
+    Person,
+    Scripted,
+    Team,
+    specs_by_agent,
+)
 from cprl.runs.checkpoints import CHECKPOINTS
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, warn_of_changes
@@ -44,7 +55,7 @@ _MOST_DIFFERENCES: Final = 3
 class StoredAgent:
     """An agent that no longer learns: a scripted policy, or a network and how it acts by it."""
 
-    scripted: ScriptedPolicy | None = None
+    scripted: ScriptedPolicy | Script | None = None
     """The policy that it follows; None for an agent that acts by a network."""
     language: Language | None = None
     """How a language model makes its plans, where it falls back to `scripted`; None without one."""
@@ -103,6 +114,15 @@ class LoadedRun:
     def specs(self) -> list[AgentSpec]:
         return specs_by_agent(self.experiment.agents, self.game.agents)
 
+    @property
+    def _governor(self) -> list[GovernorSpec]:
+        """Return the specification of the governor; [] without one."""
+        return [] if self.experiment.governor is None else [self.experiment.governor]
+
+    def governor(self, replicas: Sequence[int]) -> list[StoredAgent]:
+        """Return the governor of each of some replicas; [] without one."""
+        return [self.agent(self.game.agents, replica=replica) for replica in replicas if self._governor]
+
     @cached_property
     def spaces(self) -> Spaces:
         """Return the observations and actions of its agents, transforms included."""
@@ -139,10 +159,13 @@ class LoadedRun:
         return env
 
     def agent(self, agent: int, *, replica: int = 0) -> StoredAgent:
-        """Return an agent of a replica."""
-        if not 0 <= agent < self.game.agents:
-            raise ValueError(f"agent is {agent}; {self.path} has the agents 0 to {self.game.agents - 1}")
-        spec = self.specs[agent]
+        """Return an agent of a replica; its governor counts as the agent after the last one."""
+        specs = [*self.specs, *self._governor]
+        if not 0 <= agent < len(specs):
+            raise ValueError(f"agent is {agent}; {self.path} has the agents 0 to {len(specs) - 1}")
+        spec = specs[agent]
+        if isinstance(spec, Script):
+            return StoredAgent(scripted=spec)
         if isinstance(spec, Scripted):
             return StoredAgent(scripted=spec.policy)
         if isinstance(spec, Language):
@@ -181,7 +204,14 @@ class LoadedRun:
         """Return the policies of a replica's agents for several worlds; trained agents explore as in
         evaluation if asked to, with random numbers from the seed."""
         agents = [[self.agent(agent, replica=replica)] for agent in range(self.game.agents)]
-        return stored_policies(agents, self.playing, replicas=[replica], worlds=worlds, seed=seed)
+        return stored_policies(
+            agents,
+            self.playing,
+            replicas=[replica],
+            worlds=worlds,
+            seed=seed,
+            governor=self.governor([replica]),
+        )
 
     def episodes(self) -> pa.Table:
         """Return the table of episodes; see `cprl.runs.episodes.read_episodes`."""
@@ -287,11 +317,13 @@ def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module
     try:
         for name, state in weights.items():
             lane = name if "/" in name else f"replica_0/{name}"
-            spec = run.specs[int(lane.rpartition("_")[2])]
+            agent = int(lane.rpartition("_")[2])
+            spec = [*run.specs, *run._governor][agent]
             if not isinstance(spec, Learning | Team):
                 raise ValueError(f"{lane} is the network of an agent that does not learn")
             refusal = f"{run.path / RECIPE_FILE}: a network cannot be made"
-            networks[lane] = acting_network(instantiate(spec.algorithm).make_network(run.spaces))
+            spaces = run.spaces if agent < run.game.agents else governor_spaces(run.game)
+            networks[lane] = acting_network(instantiate(spec.algorithm).make_network(spaces))
             refusal = no_weights
             networks[lane].load_state_dict(state)
     except Exception as error:
@@ -331,12 +363,14 @@ def stored_policies(
     replicas: Sequence[int],
     worlds: int,
     seed: int,
+    governor: Sequence[StoredAgent] = (),
 ) -> JointPolicy:
     """Return the policies of stored agents of some replicas; agents of one kind are lanes of one actor.
 
     Args:
         agents: the stored agents, by agent and replica.
         seed: the seed of random numbers, with the replica and the agent.
+        governor: the stored governor of each replica; empty where the first option stays in force.
     """
     by_index = dict(enumerate(agents))
     kinds = {agent: stored[0].kind for agent, stored in by_index.items()}
@@ -346,7 +380,40 @@ def stored_policies(
         stored = decision_values(by_index)
         decisions = stored_decisions(playing, stored, replicas=replicas, worlds=worlds, seed=seed)
     actors = stored_actors(by_index, playing, kinds=kinds, seeds=seeds, worlds=worlds, stacks=True)
-    return JointPolicy(actors, decisions=decisions)
+    governs = None
+    if isinstance(playing, Game) and governor:
+        lanes = seeds(agents=[playing.agents])
+        governs = stored_governor(playing, governor, seeds=lanes, worlds=worlds)
+    return JointPolicy(actors, decisions=decisions, governor=governs)
+
+
+def stored_governor(
+    game: Game,
+    stored: Sequence[StoredAgent],
+    *,
+    seeds: Sequence[Sequence[int]],
+    worlds: int,
+    from_turn: int = 0,
+) -> GovernorActor:
+    """Return the actor of a governor that does not learn.
+
+    Args:
+        stored: the governor of each replica.
+        seeds: the seed of each replica.
+        from_turn: see `GovernorActor`.
+    """
+    assert game.governor is not None
+    by: Any = stored[0].scripted
+    if by is None:
+        (by,) = stored_actors(
+            {game.agents: stored},
+            governor_spaces(game),
+            kinds={game.agents: stored[0].kind},
+            seeds=lambda agents: seeds,
+            worlds=worlds,
+            stacks=True,
+        ).values()
+    return GovernorActor(game.governor, by, from_turn=from_turn)
 
 
 def decision_values(agents: Mapping[int, Sequence[StoredAgent]]) -> dict[int, list[Tensor]]:
