@@ -14,6 +14,7 @@ from cprl.envs import make_env
 from cprl.evaluation.populations import play_population
 from cprl.measuring.playing import evaluate
 from cprl.population import Learning, Scripted
+from cprl.runs.episodes import read_episodes
 from cprl.values import custom_of
 
 POOL = FishingPool()
@@ -98,7 +99,7 @@ def test_learning_agents_train_in_it(tmp_path):
         engine="eager",
     )
     run = cprl.run(experiment, tmp_path / "run", watch="off", figures=False)
-    assert set(cprl.load(run).episodes().column_names) >= {
+    assert set(read_episodes(run).column_names) >= {
         "rounds_survived",
         "has_survived",
         "share_of_optimum",

@@ -36,7 +36,7 @@ def test_a_law_replaces_the_institutions_of_a_game(table):
     assert game.institutions == (Quota(share=0.5, window_steps=24), Tax(rate=0.1))
     system, prompt = (message["content"] for message in request["messages"])
     assert system.startswith("Be fair.\nYou give laws to 4 agents on a board.")
-    assert "- Quota: share, a number" in system
+    assert "- Quota: observed, True or False (True); share, a number in 0..1e+06 (1);" in system
     assert prompt.startswith("Institutions now: tax (rate 0.9).\nWhat came of it:\n")
     assert "- collective_return: " in prompt
     assert given('{"institutions": []}', table, taxed)[0].institutions == ()

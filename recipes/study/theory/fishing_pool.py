@@ -1,9 +1,9 @@
 """The pool of GovSim: agents say in each round how much they take of a pool that doubles.
 
 Source: Piatti, Jin, Kleiman-Weiner and others, "Cooperate or Collapse: Emergence of Sustainable Cooperation
-in a Society of LLM Agents" (NeurIPS 2024, arXiv 2404.16698), and its program, github.com/giorgiopiatti/GovSim,
-for what happens when agents want more than there is. Five agents, twelve rounds, 100 units, which double after
-each round up to 100; below 5 units the pool has collapsed. Without the talk between rounds.
+in a Society of LLM Agents" (NeurIPS 2024, arXiv 2404.16698), and its program on GitHub, giorgiopiatti/GovSim,
+for what happens when agents want more than there is. Five agents, twelve rounds, 100 units, which double
+after each round up to 100; below 5 units the pool has collapsed. Without the talk between rounds.
 """
 
 from dataclasses import dataclass
@@ -19,10 +19,10 @@ from cprl.envs.drivers import drawn_seed
 from cprl.values import Positive, Value
 
 ABOUT = (
-    "You fish in a lake with {others} others. Each month all say at once how many tons they want to catch, from "
-    "0 to {capacity}. What is left then doubles, up to {capacity} tons. Below {collapse} tons left there is no "
-    "fish any more. There are {rounds} months. You observe the tons in the lake, the month, counted from 0, and "
-    "what you and then the others caught in the last month."
+    "You fish in a lake with {others} others. Each month all say at once how many tons they want to catch, "
+    "from 0 to {capacity}. What is left then doubles, up to {capacity} tons. Below {collapse} tons there is "
+    "no fish any more. There are {rounds} months. You observe the tons in the lake, the month, counted from "
+    "0, and what you and then the others caught in the last month."
 )
 """What a language model is told: `Language(instructions=pool.about, every_steps=1, fallback="random")`."""
 
@@ -70,7 +70,7 @@ the share of wishes above a sustainable share, is not among them."""
 
 
 class FishingEnv(EnvBase):
-    """B pools, see `FishingPool`. The lot of the last units depends on seed, world, episode and round alone."""
+    """B pools, see `FishingPool`. The lot of the last units depends on seed, world, episode, round."""
 
     batch_locked = True
 
@@ -148,7 +148,7 @@ class FishingEnv(EnvBase):
         return self._moment(terminated, truncated, reward=taken.float().unsqueeze(-1))
 
     def _shared(self, world: int, wanted: Any) -> Any:
-        """Return what agents get who want more than there is: each unit goes to one of those who want more."""
+        """Return what agents get who want more than there is: each unit goes to one who wants more."""
         place = (
             int(self.seed_bits),
             self._first_world + world,
