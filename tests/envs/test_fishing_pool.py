@@ -1,4 +1,4 @@
-"""The pool of GovSim: what is left doubles, the last units go by lot, its measures are those worked by hand."""
+"""The pool of GovSim: what is left doubles, the last units go by lot, its measures are worked by hand."""
 
 import pytest
 import torch
