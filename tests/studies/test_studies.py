@@ -17,7 +17,7 @@ from cprl.experiment.experiment import MOST_SEED, Experiment
 from cprl.institutions import Quota, Sanctioner
 from cprl.learners.settings import RolloutSettings
 from cprl.networks import MLP
-from cprl.population import Frozen, Learning, Scripted, Team, stored_of
+from cprl.population import Frozen, Learning, Scripted, Team, stored_in
 from cprl.studies import Integers, LogUniform, Uniform
 from cprl.studies.factors import draw_combinations, factors_of, values_at, with_changes
 from cprl.studies.study import (
@@ -198,7 +198,7 @@ def test_each_block_has_the_stored_partners_of_its_own_replicas(starts):
     def partners(study):
         """The stored replica of the second agent in each replica of a study."""
         return [
-            stored_of(trial.experiment.agents[1]).replica_for(replica)
+            only_stored(trial.experiment.agents[1]).replica_for(replica)
             for trial in trials_of(study)
             for replica in range(trial.block.replicas)
         ]
@@ -342,7 +342,7 @@ def test_runs_are_kept_relative_to_the_study_and_other_texts_as_they_are(tmp_pat
         if study.reference is None:
             elsewhere = Study.from_config(table, directory="../studies/x")
             there, here = (each.all_conditions[1].experiment for each in (elsewhere, study))
-            assert stored_of(there.agents[1]).run == f"../{stored_of(here.agents[1]).run}"
+            assert only_stored(there.agents[1]).run == f"../{only_stored(here.agents[1]).run}"
             assert there.transforms == here.transforms
 
 

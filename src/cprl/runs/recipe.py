@@ -212,7 +212,7 @@ def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") ->
     return dict(recipe["experiment"])
 
 
-STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)(\.start_from)?\.run")
+STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)(\.start_from|\.runs\.\d+)?\.run")
 """The path of a study's factor that is the run of a `Frozen` agent."""
 
 

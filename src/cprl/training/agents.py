@@ -23,12 +23,13 @@ from cprl.objectives.rewards import reward_name
 from cprl.policies.actors import random_agents
 from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
-from cprl.policies.rng import Purpose, lane_name, lane_seeds
+from cprl.policies.rng import Purpose, lane_name, lane_names, lane_seeds
 from cprl.policies.scripted import RULES_READ, ScriptedActor
 from cprl.population import (
     AgentSpec,
     Frozen,
     Learning,
+    Pool,
     Scripted,
     Team,
     grouped,
@@ -37,7 +38,15 @@ from cprl.population import (
     refuse_undecided,
     specs_by_agent,
 )
-from cprl.training.stored import LoadedRun, StoredAgent, decision_values, load, stored_actors, trained_agent
+from cprl.training.stored import (
+    LoadedRun,
+    PoolActor,
+    StoredAgent,
+    decision_values,
+    load,
+    stored_actors,
+    trained_agent,
+)
 from cprl.values import Custom, instantiate, short_repr
 
 
@@ -97,13 +106,15 @@ class Population:
         self._specs_by_agent = specs_by_agent(specs, self.spaces.agents)
         check_scripted(groups, self.spaces, self._game)
         self._replica_numbers = range(first_replica, first_replica + self.replicas)
-        self._stored_agents = self._load_stored_agents(weights or {})
         self.learners: dict[tuple[int, ...], AnyLearner] = {}
         for spec, agents in groups:
             if isinstance(spec, Learning | Team):
                 _refuse_only_in_play(spec, env)
                 self.learners[agents] = self._make_learner(spec, agents, engine, starts)
+        self._pools: dict[int, PoolActor] = {}
+        self._stored_agents = self._load_stored_agents(weights or {})
         self.others: dict[ActorAgents, nn.Module] = self.other_actors(Purpose.EXPLORATION, worlds=worlds)
+        self.others |= {(agent,): pool for agent, pool in self._pools.items()}
         self.decisions: BanditDecider | None = self._make_decider()
         """The decisions of the agents on the game's ballots, and how they learn them; None without
         ballots."""
@@ -144,41 +155,72 @@ class Population:
         return JointPolicy(actors, decisions=decisions)
 
     def networks(self) -> dict[str, nn.Module]:
-        """Return copies of the learners' current acting networks, by "replica_0/agent_0" and so on."""
+        """Return copies of the learners' current acting networks, by "replica_0/agent_0" and so on, and the
+        networks of past selves, see `PoolActor.networks`."""
         networks: dict[str, nn.Module] = {}
         for learner in self.learners.values():
             networks |= learner.networks()
+        for pool in self._pools.values():
+            networks |= pool.networks()
         return networks
 
     def as_stored(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
         """Return copies of the current agents of some replicas, by agent and replica."""
         networks = self.networks()
         decisions = {} if self.decisions is None else self.decisions.learned()
+        others = self._others_as_stored()
         agents: list[list[StoredAgent]] = []
         for agent, spec in enumerate(self._specs_by_agent):
             if isinstance(spec, Learning | Team):
                 lanes = [lane_name(replica, agent) for replica in replicas]
                 agents.append([trained_agent(spec, networks[lane], decisions.get(lane)) for lane in lanes])
             else:
-                agents.append(
-                    [self._stored_agents[agent][self._replica_numbers.index(replica)] for replica in replicas]
-                )
+                agents.append([others[agent][self._replica_numbers.index(replica)] for replica in replicas])
         return agents
 
     def _load_stored_agents(self, weights: Mapping[str, str]) -> dict[int, list[StoredAgent]]:
-        """Return the scripted and frozen agents of each replica by index; each stored run is read once."""
+        """Make the pools; return the scripted and frozen agents of each replica by index. Each stored run is
+        read once."""
         runs: dict[str, LoadedRun] = {}
+
+        def frozen(spec: Frozen) -> list[StoredAgent]:
+            if spec.run not in runs:
+                runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
+                _refuse_other_game(runs[spec.run], self.spaces, self._game, is_to_decide=True)
+            replicas = map(spec.replica_for, self._replica_numbers)
+            return [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
+
+        seeds = partial(lane_seeds, self.seed, replicas=self._replica_numbers, purpose=Purpose.EXPLORATION)
         agents: dict[int, list[StoredAgent]] = {}
         for agent, spec in enumerate(self._specs_by_agent):
             if isinstance(spec, Scripted):
                 agents[agent] = [StoredAgent(scripted=spec.policy)] * self.replicas
             elif isinstance(spec, Frozen):
-                if spec.run not in runs:
-                    runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
-                    _refuse_other_game(runs[spec.run], self.spaces, self._game, is_to_decide=True)
-                replicas = map(spec.replica_for, self._replica_numbers)
-                agents[agent] = [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
+                agents[agent] = frozen(spec)
+            elif isinstance(spec, Pool):
+                self._pools[agent] = PoolActor(
+                    list(map(frozen, spec.runs)),
+                    self.playing,
+                    seeds=seeds(agents=[agent]),
+                    worlds=self.worlds,
+                    draw=spec.draw,
+                    own_past=spec.own_past,
+                    present=partial(self._present, spec.own_past),
+                )
         return agents
+
+    def _present(self, own_past: Any) -> list[StoredAgent]:
+        """Return copies of the agent of an `OwnPast` as it is now, of each replica."""
+        agent = own_past.agent
+        spec: Any = self._specs_by_agent[agent]
+        (learner,) = (learner for agents, learner in self.learners.items() if agent in agents)
+        networks = learner.networks()
+        names = lane_names(replicas=self._replica_numbers, agents=[agent])
+        return [trained_agent(spec, networks[name], None) for name in names]
+
+    def _others_as_stored(self) -> dict[int, list[StoredAgent]]:
+        """Return the agents of each replica that do not learn by index, pools as they are now."""
+        return self._stored_agents | {agent: pool.as_stored() for agent, pool in self._pools.items()}
 
     def other_actors(
         self, purpose: Purpose, *, worlds: int, replicas: int | None = None
@@ -191,7 +233,7 @@ class Population:
             replicas: the number of replicas; by default all.
         """
         numbers = self._replica_numbers[:replicas]
-        agents = {agent: stored[: len(numbers)] for agent, stored in self._stored_agents.items()}
+        agents = {agent: stored[: len(numbers)] for agent, stored in self._others_as_stored().items()}
         kinds = {
             agent: (getattr(self._specs_by_agent[agent], "run", None), stored[0].kind)
             for agent, stored in agents.items()
