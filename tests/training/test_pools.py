@@ -10,7 +10,8 @@ import torch
 from matrix_game import MatrixGame
 from recurrent_learners import ON_POLICY
 from same_runs import assert_same_training, differences
-from small_learners import ALGORITHMS, FOUR, GAME, population, ran, trained
+from small_learners import ALGORITHMS, FOUR, GAME, population, ran
+from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import cprl
@@ -33,7 +34,7 @@ CLOCK = GAME.rules.episode_steps
 def stored(tmp_path_factory):
     """A run by DQN, DQN, PPO and a script; the tests stand beside it."""
     folder = tmp_path_factory.mktemp("stored")
-    ran(folder, [DQN, DQN, PPO, Scripted("greedy")], name="earlier")
+    ran(folder, [DQN, DQN, PPO, Scripted("random")], name="earlier")
     return folder
 
 
@@ -70,7 +71,7 @@ class Drawn:
 
 def training_of(pool, *, learner=DQN, episodes=6, replicas=2, worlds=1, seed=3, first=0, callbacks=()):
     """A population with a pool beside agent 0, trained."""
-    specs = [learner, pool, Scripted("greedy"), Scripted()]
+    specs = [learner, pool, Scripted(), Scripted()]
     how = {"seed": seed, "worlds": worlds, "first_replica": first, "engine": "eager"}
     env = CommonsEnv(GAME, replicas * worlds, seed=seed, first_world=first * worlds)
     agents = Population(env, specs, **how)
@@ -90,12 +91,14 @@ def test_each_world_draws_for_itself_and_keeps_its_opponent_for_the_episode():
 
 
 def test_all_opponents_are_equally_likely():
-    pools = population([Pool(runs=(earlier(3),) * 3), Pool(runs=(earlier(3),) * 3), *[Scripted()] * 2]).others
-    moment = CommonsEnv(GAME, 2, seed=1).reset()["agents"][:, :1]
+    pools = population([Pool(runs=(earlier(0),) * 3), Pool(runs=(earlier(0),) * 3), *[Scripted()] * 2]).others
+    windows = CommonsEnv(GAME, 2, seed=1).reset()["agents", "observation"][:, :1]
+    zeros = torch.zeros(2, 1, 1)  # an episode begins
     draws = []
     for _ in range(1500):
-        moment["recurrent_state"] = torch.zeros(2, 1, 1)  # an episode begins
-        draws.append([int(n) for agent in (0, 1) for n in pools[agent,](moment)["recurrent_state"]])
+        moments = [TensorDict({"observation": windows, "recurrent_state": zeros}, [2]) for _ in range(2)]
+        played = [pools[agent,](moment) for agent, moment in enumerate(moments)]
+        draws.append([int(number) for moment in played for number in moment["recurrent_state"]])
     for columns in zip(*draws, strict=True):
         counts = Counter(columns)
         # 1,500 draws of three: 500 each, with a standard deviation of 18.
@@ -231,7 +234,7 @@ EXPERIMENT = {
 
 
 def experiment(pool, *, learner=DQN, **changes):
-    agents = (learner, pool, Scripted("greedy"), Scripted())
+    agents = (learner, pool, Scripted(), Scripted())
     return Experiment(name="pooled", game=GAME, agents=agents, **{**EXPERIMENT, **changes})
 
 
@@ -242,45 +245,45 @@ FULL = Pool(
 
 @pytest.mark.integration
 @pytest.mark.parametrize(
-    "learner",
+    ("learner", "steps"),
     [
-        DQN,
-        Learning(ON_POLICY["PPO"]),
-        Learning(Tabular(settings=TabularSettings())),
-        Team(ALGORITHMS["DQN"], agents=(0,), share_parameters=True),
+        (DQN, (1, 31, 47)),
+        (Learning(ON_POLICY["PPO"]), (35,)),
+        (Learning(Tabular(settings=TabularSettings())), (35,)),
+        (Team(ALGORITHMS["DQN"], agents=(0,), share_parameters=True), (35,)),
     ],
     ids=["DQN", "recurrent", "table", "team"],
 )
-def test_a_training_against_a_pool_is_stopped_and_resumed_bit_for_bit(learner, tmp_path, stopped):
+def test_a_training_against_a_pool_is_stopped_and_resumed_bit_for_bit(learner, steps, tmp_path, stopped):
     changes = {"learner": learner, "evaluate_every": 4, "callbacks": (Custom("own_parts:Stopping"),)}
     pooled = experiment(FULL, **changes)
-    whole = cprl.run(pooled, tmp_path / "whole", watch="off")
-    for step in (1, 31, 47):
+    whole = cprl.run(pooled, tmp_path / "whole", watch="off", figures=False)
+    for step in steps:
         run = tmp_path / f"stopped_{step}"
-        stopped(step, pooled, run)
+        stopped(step, pooled, run, figures=False)
         assert checkpoints_in(run / "checkpoints")
-        cprl.run(pooled, run, resume=True, watch="off")
+        cprl.run(pooled, run, resume=True, watch="off", figures=False)
         assert_same_training(run, whole)
         assert differences(run, whole) == []
 
 
 @pytest.mark.integration
 def test_a_longer_training_continues_bit_for_bit(tmp_path):
-    whole = cprl.run(experiment(FULL, episodes=16), tmp_path / "whole", watch="off")
-    longer = cprl.run(experiment(FULL), tmp_path / "longer", watch="off", keep_checkpoint=True)
-    cprl.run(experiment(FULL, episodes=16), longer, resume=True, watch="off")
+    whole = cprl.run(experiment(FULL, episodes=16), tmp_path / "whole", watch="off", figures=False)
+    longer = cprl.run(experiment(FULL), tmp_path / "longer", watch="off", figures=False, keep_checkpoint=True)
+    cprl.run(experiment(FULL, episodes=16), longer, resume=True, watch="off", figures=False)
     assert_same_training(longer, whole)
 
 
 @pytest.mark.integration
 def test_a_stored_pool_is_loaded_evaluated_crossed_exported_and_frozen(tmp_path, stopped):
-    run = cprl.run(experiment(FULL), "pooled", watch="off")
+    run = cprl.run(experiment(FULL), "pooled", watch="off", figures=False)
     loaded = cprl.load(run)
     assert loaded.experiment == experiment(FULL)
     assert loaded.replicas == [0, 1]
     pool = loaded.agent(1, replica=1)
     assert len(pool.pool) == 5
-    assert [opponent.scripted for opponent in pool.pool] == [None, None, "greedy", None, None]
+    assert [opponent.scripted for opponent in pool.pool] == [None, None, "random", None, None]
     names = [name for name in loaded.networks if name.startswith("replica_1/agent_1/past_")]
     assert [opponent.network for opponent in pool.pool[3:]] == [loaded.networks[name] for name in names[-2:]]
     assert evaluate_run(run, Fresh(episodes=2)).num_rows == 2 * 2 * 4 * 2
@@ -288,12 +291,14 @@ def test_a_stored_pool_is_loaded_evaluated_crossed_exported_and_frozen(tmp_path,
     assert loaded.env(2).rollout(5, loaded.policy(1, worlds=2))["agents", "action"].shape == (2, 5, 4)
     exported = cprl.load(export_results(run, Path("deep/exported")))
     assert len(exported.agent(1).pool) == 5
-    again = cprl.run(replace(experiment(Frozen("pooled", 1)), name="again"), "again", watch="off")
+    again = cprl.run(
+        replace(experiment(Frozen("pooled", 1)), name="again"), "again", watch="off", figures=False
+    )
     assert len(cprl.load(again).agent(1).pool) == 5
     assert partners_in([FULL]) == ["earlier"]
     assert set(json.loads((run / "recipe.json").read_text())["frozen"]) == {"../earlier"}
     pooled = experiment(FULL, callbacks=(Custom("own_parts:Stopping"),))
-    running = stopped(35, pooled, tmp_path / "running")
+    running = stopped(35, pooled, tmp_path / "running", figures=False)
     cprl.trust("own_parts:Stopping")
     assert len(cprl.load(running).agent(1).pool) == 5, "of a checkpoint"
 
