@@ -18,7 +18,7 @@ from typing import Any, Final
 import tyro
 
 from cprl import Experiment
-from cprl.evaluation.film_pictures import write_gif
+from cprl.evaluation.film import write_gif
 from cprl.evaluation.fresh import fresh_episodes, record
 from cprl.evaluation.populations import commons_game
 from cprl.pictures.image import world_image

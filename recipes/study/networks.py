@@ -3,7 +3,7 @@
     python recipes/study/networks.py --jobs 2
 
 Four independent PPO agents on `commons` as run, in each condition 8 replicas of 400 episodes.
-docs/networks.md says what the networks cost, and what the first 200 episodes of each condition brought.
+docs/algorithms.md says what the networks cost, and what the first 200 episodes of each condition brought.
 """
 
 from dataclasses import replace

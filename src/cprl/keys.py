@@ -73,7 +73,14 @@ DECISION: Final = (AGENTS, "decision")
 agent's choice on every ballot, and is read in an episode's first turn alone, see BALLOTS_DUE."""
 
 IN_FORCE: Final = "in_force"
-"""float32 [B, V]: the outcome that is in force on each of `Game.ballots`, by the agents' decisions."""
+"""float32 [B, F]: what is in force of all that is decided, see `Game.in_force`."""
+
+SEEN: Final = "seen"
+"""float32 [B, S]: what the governor sees, see `Governor.sees`; only in games with a governor."""
+
+RULE: Final = "rule"
+"""int64 [B]: the option that the governor puts in force in this turn, an index of `Governor.options`. A turn
+without the entry leaves in force what is."""
 
 BALLOTS_DUE: Final = "ballots_due"
 """bool [B, V]: which of `Game.ballots` are held in the coming turn, by the agents' decisions in it."""

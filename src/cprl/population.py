@@ -1,5 +1,5 @@
-"""Specifications of agents: `Learning`, `Team`, `Scripted`, `Frozen`, `Pool` and `Person`, the values that an
-experiment's `agents` holds.
+"""Specifications of agents: `Learning`, `Team`, `Scripted`, `Language`, `Frozen`, `Pool` and `Person`, the
+values that an experiment's `agents` holds.
 
 A population is a sequence of specifications. A `Team` stands once and names its agents; the other
 specifications stand for one agent each and take the remaining agent indices in order.
@@ -15,6 +15,8 @@ from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.learners.settings import EpsilonGreedy
 from cprl.objectives.rewards import Reward
 from cprl.policies.decisions import Bandit
+from cprl.policies.governors import Script
+from cprl.policies.language import Language as Language
 from cprl.policies.scripted import ScriptedPolicy
 from cprl.values import AgentIndices, Custom, Natural, Positive, Steps, Value, Where, checked
 
@@ -174,8 +176,8 @@ class Pool(Value):
     agent that learns here. It learns nothing.
 
     Each world draws for itself when its episode begins, independently of other worlds, replicas and pools.
-    A past self plays in its own replica. An episode draws again if its past self is deleted meanwhile, which
-    is when another copy has followed after it left the pool. In games with ballots a pool votes at random.
+    A past self plays in its own replica. It is deleted `every_steps` steps after it has left the pool; an
+    episode that it still plays then draws again. In games with ballots a pool votes at random.
 
     Args:
         runs: the agents of earlier runs.
@@ -200,8 +202,10 @@ class Person(Value):
     played; it cannot be trained, nor its people played again."""
 
 
-AgentSpec: TypeAlias = Learning | Team | Scripted | Frozen | Pool | Person
+AgentSpec: TypeAlias = Learning | Team | Scripted | Language | Frozen | Pool | Person
 """The specification of an agent, or of a team."""
+GovernorSpec: TypeAlias = Learning | Frozen | Script
+"""The specification of a governor. A `Frozen` one counts as the agent after the last of its run."""
 
 
 def any_learns(specs: Sequence[AgentSpec]) -> bool:
@@ -219,7 +223,7 @@ def refuse_people(specs: Sequence[AgentSpec]) -> None:
     if has_people(specs):
         raise ValueError(
             f"agents[{specs.index(Person())}] is a Person, and people play in hosted games: cprl host; "
-            "allowed: Learning, Team, Scripted, Frozen, Pool"
+            "allowed: Learning, Team, Scripted, Language, Frozen, Pool"
         )
 
 
@@ -252,6 +256,8 @@ def _describe(spec: AgentSpec) -> str:
             return f"by {name}{team}"
         case Scripted():
             return f"by the script {spec.policy!r}"
+        case Language():
+            return f"by the language model {spec.model}"
         case Frozen():
             return "of an earlier run"
         case Pool():
@@ -340,7 +346,7 @@ def exploring(specs: Sequence[AgentSpec]) -> list[EpsilonGreedy]:
     return [algorithm.settings for algorithm in greedy if isinstance(algorithm.settings, EpsilonGreedy)]
 
 
-def partners_in(specs: Iterable[AgentSpec]) -> list[str]:
+def partners_in(specs: Iterable[Any]) -> list[str]:
     """Return the directories of the earlier runs whose agents play in a population, sorted."""
     playing = (spec for spec in specs if isinstance(spec, Frozen | Pool))
     return sorted({stored.run for spec in playing for stored in stored_in(spec).values()})

@@ -45,7 +45,6 @@ from cprl.evaluation import (
     scenarios_of,
 )
 from cprl.evaluation.cross_play import CROSS_PLAY_RETURNS, PAIR
-from cprl.evaluation.evaluate import refuse_unlike
 from cprl.evaluation.populations import agents_of, join_tables, play_fresh, table_note
 from cprl.experimental.empirical_game import play_empirical_game
 from cprl.experimental.movement import trace
@@ -64,7 +63,7 @@ from cprl.runs.recipe import start_run
 from cprl.system.process import one_thread
 from cprl.training import Schedule, train
 from cprl.training.agents import Population
-from cprl.training.stored import StoredAgent, stored_policies
+from cprl.training.stored import StoredAgent, refuse_unlike, stored_policies
 
 
 @pytest.fixture(scope="module")

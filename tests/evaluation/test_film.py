@@ -20,13 +20,12 @@ from stored_runs import CORRIDORS, command, stored
 
 from cprl import Custom, Game, Rules, load, maps
 from cprl.commons.cells import APPLE, GROUND
-from cprl.evaluation import film_pictures
 from cprl.evaluation.film import Style, film, film_video, titles_of
-from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.evaluation.fresh import fresh_episodes
 from cprl.experimental.export_turns import export_turns
 from cprl.institutions import Monitoring, Quota
 from cprl.pictures.colours import PALETTE, agent_colour
+from cprl.pictures.episode_picture import EpisodePicture
 from cprl.pictures.image import EMPTY_SITE_COLOUR
 from cprl.values import trusting
 
@@ -200,7 +199,7 @@ def pictures_of(path, wide):
 
 
 def test_an_mp4_without_imageio_ffmpeg_is_refused(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr(film_pictures, "find_spec", lambda name: None)
+    monkeypatch.setattr("cprl.evaluation.film.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match="imageio-ffmpeg"):
         film_video(runs / "greedy", tmp_path / "a.mp4")
 

@@ -10,9 +10,10 @@ import pytest
 from matrix_games import prisoners_dilemma
 from stored_runs import CORRIDORS, DQN, MEADOW, an_experiment, command, stored
 
+from cprl.commands.play_by_keys import play_in_terminal
 from cprl.evaluation.film import Style, film, film_video
 from cprl.evaluation.fresh import averages_of, fresh_episodes, fresh_seed, typical_replica
-from cprl.evaluation.play import open_session, play_in_terminal
+from cprl.evaluation.play import open_session
 from cprl.runs.recipe import start_run
 from cprl.runs.weights import save_weights
 from cprl.studies.report import report

@@ -11,7 +11,8 @@ from places import ROOT
 from stored_runs import command, stored
 
 from cprl import CommonsEnv, Game, River, Rules, keys, maps, presets
-from cprl.evaluation.play import Session, board_text, help_of, keys_of, open_session, play_in_terminal
+from cprl.commands.play_by_keys import board_text, help_of, keys_of, play_in_terminal
+from cprl.evaluation.play import Session, open_session
 from cprl.measuring.tracker import EpisodeTracker
 
 DRAWING = """

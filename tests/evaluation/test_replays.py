@@ -90,7 +90,7 @@ def test_without_their_turns_people_are_in_a_report_but_not_in_a_film(tmp_path, 
     command(monkeypatch, capsys, "report", run)
     text = (run / "report.html").read_text(encoding="utf-8")
     assert "<h2>The episodes that people played</h2>" in text
-    assert "2 people, played for 1 episodes in 3 groups." in text
+    assert "2 people, played for 1 episode in 3 groups." in text
     assert "random play" not in text
     assert "cprl run RUN" not in text
     with pytest.raises(SystemExit, match="episodes is 5"):

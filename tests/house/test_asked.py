@@ -13,6 +13,7 @@ from changes import PPO_AGENT
 from courses import end_steps
 from finished import name_among
 from judging import FROZEN, LEARNING, MORE_EXPLORATION, Outcomes, contrast, judge, judged_lines, judged_page
+from recovery import first_back
 from schedules import exploration_at_end, target_period, updates
 from scipy import stats
 from sheet import sheet
@@ -199,6 +200,19 @@ def test_episodes_after_a_change_of_the_game_begin_at_the_change():
     ends, world, steps = zip(*sorted(ended), strict=True)
     episodes = pa.table({"world": world, "steps": steps})
     assert end_steps(episodes, worlds=3, change=3 * change).tolist() == [3 * turn for turn in ends]
+
+
+@pytest.mark.parametrize(
+    ("differences", "steps"),
+    [
+        ([0.0] * 40, 0),
+        ([-100.0] * 12 + [0.0] * 28, 100_000),  # its first mean of five blocks within the margin
+        ([np.nan, 60.0, 60.0] + [40.0] * 37, 0),  # the mean of the first four with an episode
+        ([MARGIN + 1] * 40, np.nan),
+    ],
+)
+def test_a_replica_is_back_when_its_mean_difference_is_within_the_margin(differences, steps):
+    assert first_back(np.array(differences)) == pytest.approx(steps, nan_ok=True)
 
 
 def test_income_is_the_harvest_where_no_money_moves():

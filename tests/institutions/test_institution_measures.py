@@ -15,6 +15,7 @@ from cprl.institutions import (
     COUNT_NAMES,
     Boundaries,
     ClosedSeason,
+    Governor,
     GraduatedSanctions,
     Levies,
     Mediation,
@@ -59,7 +60,11 @@ FINES = np.array([2.0, 0.0, 1.0, 0.0])
 TRANSFERS = np.array([0.0, 1.0, 0.0, 2.0])
 IN_PLAY = np.array([10, 10, 8, 4])
 TAGS = np.array([2, 1, 1, 0])
-OF_LAW = [name for name, metric in METRICS.items() if metric.is_of_institutions]
+OF_LAW = [
+    name
+    for name, metric in METRICS.items()
+    if metric.is_of_institutions and "wanted" not in metric.needs  # which games with a governor have
+]
 OF_GROUPS = {name for name in OF_LAW if name.endswith(("_within", "_between"))}
 COUNTED = {
     "own_bites": np.array([5, 2, 3, 0]),
@@ -431,6 +436,7 @@ def test_a_game_with_all_institutions_has_all_metrics_and_others_those_that_conc
         Tax,
         Levies,
         Vote,
+        Governor,
         Sanctioner,
         Punishment,
     }

@@ -19,11 +19,11 @@ import cprl
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
 from cprl.evaluation import Fresh, evaluate_run
 from cprl.evaluation.film import Style, film, film_video
-from cprl.evaluation.film_pictures import EpisodePicture
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
 from cprl.measuring.registry import reported_by
 from cprl.measuring.statistics import estimates, number_format
 from cprl.measuring.table import where
+from cprl.pictures.episode_picture import EpisodePicture
 from cprl.pictures.image import regions_of
 from cprl.policies.actors import random_agents
 from cprl.population import Scripted

@@ -9,6 +9,7 @@ from tiny_study import GAME, LEARNING, TINY
 import cprl
 from cprl import algorithms, institutions, population
 from cprl.objectives import rewards
+from cprl.policies.governors import Constant
 from cprl.values import KINDS
 
 REQUIRED = {
@@ -17,6 +18,7 @@ REQUIRED = {
     "EarlierGame": lambda: cprl.EarlierGame(game=GAME, steps=100),
     "Learning": lambda: LEARNING,
     "Team": lambda: population.Team(algorithms.VDN(settings=algorithms.DQNSettings()), agents=(0, 1)),
+    "Language": lambda: population.Language(model="small"),
     "Frozen": lambda: population.Frozen("runs/none", agent=0),
     "OwnPast": lambda: population.OwnPast(agent=0),
     "Pool": lambda: population.Pool(runs=(population.Frozen("runs/none", agent=0),)),
@@ -27,6 +29,8 @@ REQUIRED = {
     "Boundaries": lambda: institutions.Boundaries.strips(height=3, width=5, agents=2),
     "Levies": lambda: institutions.Levies(groups=((0,), (1,))),
     "Vote": lambda: institutions.Vote(on=institutions.Tax()),
+    "Constant": lambda: Constant(0.5),
+    "Governor": lambda: institutions.Governor(sets="tax.rate"),
     "Custom": lambda: cprl.Custom("torchrl.envs.transforms:RewardScaling", arguments={"loc": 0.0}),
 }
 """Values of the kinds that cannot be made of nothing, or of their settings alone."""

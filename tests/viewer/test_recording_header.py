@@ -28,14 +28,15 @@ from cprl.pictures.colours import PALETTE, agent_colour
 from cprl.pictures.readable import rules_of
 from cprl.policies.actors import random_agents
 from cprl.runs.episodes import EpisodeTable
+from cprl.runs.recipe import recipe_table
 from cprl.training import Schedule, train
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.frames import FrameSchedule, Wall
 from cprl.viewer.header import CompilingNotice, Header, fresh_result
 from cprl.viewer.layout import layout
 from cprl.viewer.live import LiveStream, Stream
-from cprl.viewer.logger import RerunLogger, recipe_table, send_buffer
-from cprl.viewer.pictures import Pictures, Samples, gini, lorenz_curve, visit_maps
+from cprl.viewer.logger import RerunLogger, send_buffer
+from cprl.viewer.pictures import Pictures, Samples, visit_maps
 from cprl.viewer.scene import Curves, Panels, plotted_numbers, scene_of
 from cprl.viewer.view import Plots
 
@@ -465,8 +466,8 @@ def run(tmp_path_factory):
 def test_the_gini_coefficient_of_a_lorenz_curve_is_one_minus_equality():
     for harvest in ([4.0, 1.0, 0.0], [2.0, 2.0], [0.0, 0.0, 0.0, 9.0], [5.0]):
         equality = float(social.equality(np.array(harvest)))
-        assert gini(lorenz_curve(np.array(harvest))) == pytest.approx(1 - equality)
-    assert np.isnan(lorenz_curve(np.zeros(3))).all()
+        assert social.gini(social.lorenz_curve(np.array(harvest))) == pytest.approx(1 - equality)
+    assert np.isnan(social.lorenz_curve(np.zeros(3))).all()
 
 
 def test_the_lorenz_curve_is_the_mean_over_the_episodes_of_all_replicas(run):

@@ -17,9 +17,11 @@ from hosted_runs import hosted as hosted_run
 
 import cprl
 from cprl import institutions, keys
-from cprl.population import Person
+from cprl.measuring.playing import evaluate
+from cprl.population import Person, Scripted
 from cprl.runs.episodes import batches_in, read_episodes
 from cprl.runs.files import RunLockedError
+from cprl.training.agents import Population
 from cprl.web import hall as hall_module, hosted_round
 from cprl.web.hall import Hall, JoinRefusedError
 from cprl.web.hosted_round import Journal
@@ -218,6 +220,18 @@ def test_two_servers_cannot_write_one_session_and_another_session_is_refused(tmp
     assert [path.name for path in (tmp_path / "other").iterdir()] == ["thesis.txt"]
 
 
+def test_a_folder_that_was_left_with_the_link_alone_is_begun_with_another_one(tmp_path):
+    link = tmp_path / "out" / "join.txt"
+    link.parent.mkdir()
+    link.write_text("old")
+    long_path = "a" * 300
+    hall = Hall(session(), link.parent)
+    hall.close()
+    assert hall.token == link.read_text() != "old"
+    assert link.stat().st_mode & 0o077 == 0
+    assert session(runs=(long_path,)).runs == (long_path,)
+
+
 def test_who_has_the_link_gets_a_seat_until_all_are_taken(tmp_path, monkeypatch):
     with hosted(tmp_path / "out", session(), monkeypatch) as hall:
         with pytest.raises(JoinRefusedError) as wrong:
@@ -347,6 +361,25 @@ def test_what_other_people_played_is_not_shown_as_of_trained_agents(tmp_path, mo
         assert hall.rounds[0].trained() is None
 
 
+def test_trained_agents_stand_on_the_end_page_with_an_interval_over_replicas(tmp_path, monkeypatch):
+    """Two replicas of 10 and 12 apples an agent: 11, and 12.706 x 1 beside it."""
+    averages = {0: (100.0, 20.0), 1: (120.0, 24.0)}
+    monkeypatch.setattr(hosted_round, "averages_of", lambda run: averages)
+    with hosted(tmp_path / "out", session(), monkeypatch) as hall:
+        this = hall.rounds[0]
+        this._runs = [SimpleNamespace(game=this.game, specs=[])]
+        trained = this.trained()
+        assert (trained["harvest"], trained["survival_steps"]) == (11.0, 110.0)
+        assert trained["harvest_interval"] == pytest.approx((0.0, 23.706), abs=0.001), "no harvest is below 0"
+        del averages[1]
+        assert this.trained() == {
+            "harvest": 10.0,
+            "harvest_interval": None,
+            "survival_steps": 100.0,
+            "survival_steps_interval": None,
+        }
+
+
 def test_people_vote_and_write_to_their_group_and_the_data_keep_both(tmp_path, monkeypatch):
     vote = institutions.Vote(on=institutions.Tax(), choices=(0.0, 0.5, 1.0))
     plan = session(people=3, groups=2, rounds=(("vote", (vote,)),), pause_seconds=30.0, chat=True)
@@ -417,4 +450,8 @@ def test_a_board_is_enlarged_for_its_seats_and_the_turns_of_greedy_players_are_k
     dying = small_game(regrow_prob=(0.0, 0.0), episode_steps=60)
     with hosted(tmp_path / "out", session(game=dying, people=3), monkeypatch) as hall:
         assert hall.rounds[0].game.agents == 3
-        assert 2 < hall.rounds[0].greedy_turns < 60
+        greedy = [Scripted("greedy")] * 3
+        env = cprl.CommonsEnv(hall.rounds[0].game, seed=hall.rounds[0].seed)
+        (episode,) = evaluate(env, Population(env, greedy, seed=hall.rounds[0].seed).policy(1))
+        assert 2 < episode.steps < 60
+        assert episode.terminated

@@ -16,8 +16,7 @@ from places import ROOT
 
 from cprl.runs.episodes import batches_in, read_episodes
 from cprl.web import serving
-from cprl.web.host import application
-from cprl.web.serving import names_of
+from cprl.web.host import routes_of
 
 PAGE = ("GET", "/")
 
@@ -25,11 +24,11 @@ PAGE = ("GET", "/")
 @asynccontextmanager
 async def served(hall):
     """Yield the address of a running server, and a client of it."""
-    hosts = set()
-    async with serving.serving(application(hall, hosts), ["127.0.0.1"], 0) as places:
-        hosts |= names_of(*places[0])
-        async with aiohttp.ClientSession(f"http://127.0.0.1:{places[0][1]}") as client:
-            yield client
+    async with (
+        serving.serving(routes_of(hall), ["127.0.0.1"], 0) as places,
+        aiohttp.ClientSession(f"http://127.0.0.1:{places[0][1]}") as client,
+    ):
+        yield client
 
 
 def ask(tmp_path, monkeypatch, question, plan=None):
@@ -203,10 +202,8 @@ def test_an_answer_that_takes_too_long_is_closed_and_a_socket_is_not(monkeypatch
         return ws
 
     async def run():
-        hosts = set()
-        app = serving.guarded([web.get("/slow", slow), web.get("/socket", socket)], hosts)
-        async with serving.serving(app, ["127.0.0.1"], 0) as places:
-            hosts |= names_of(*places[0])
+        routes = [web.get("/slow", slow), web.get("/socket", socket)]
+        async with serving.serving(routes, ["127.0.0.1"], 0) as places:
             address = f"http://127.0.0.1:{places[0][1]}"
             async with aiohttp.ClientSession(address) as client, client.ws_connect("/socket") as ws:
                 with pytest.raises(aiohttp.ClientError):

@@ -5,6 +5,7 @@ Modules, in the order in which one reads them:
     recipe_command  recipe_main: the command line of a recipe
     flags           the fields of an experiment as flags
     play_stored     cprl film, show, report, play, evaluate, crossplay and scenarios
+    play_by_keys    an episode in the terminal, for cprl play
     studies         cprl sweep; study_main: the command line of a recipe of a study
     table_command   cprl table
     host_command    cprl host

@@ -202,7 +202,8 @@ def play(
     seed = PLAY_SEED if session.seed is None else session.seed
     begin_playing(seed)
 
-    from cprl.evaluation.play import open_session, play_in_terminal
+    from cprl.commands.play_by_keys import play_in_terminal
+    from cprl.evaluation.play import open_session
 
     play_in_terminal(open_session(board, **vars(session)))
 

@@ -14,8 +14,9 @@ from cprl.commons.world import BEGIN, PLAY, REFRESH, StepOutput, Worlds, WorldVi
 from cprl.institutions import Law
 from cprl.institutions.arrays import state_arrays
 from cprl.institutions.law import new_law
+from cprl.institutions.ledger import VIOLATIONS
 from cprl.values import Range, Seed, checked
-from cprl.values.array_types import Bool, Int64, UInt8
+from cprl.values.array_types import Bool, Float32, Int64, UInt8
 
 
 class Driver(Protocol):
@@ -166,6 +167,30 @@ class Batch:
         self._run(PLAY, output, actions=actions, decisions=decisions)
         return output
 
+    def put_in_force(self, rule: Int64) -> None:
+        """Put an option of the governor in force in each world from the coming turn on; `rule`: int64 [B]."""
+        governor = self.game.governor
+        if governor is None or rule.shape != (self.size,) or not _are_indices(rule, len(governor.options)):
+            allowed = "no rule" if governor is None else f"[{self.size}] of 0 to {len(governor.options) - 1}"
+            raise ValueError(f"rule is {rule.dtype} {list(rule.shape)}; allowed: {allowed}")
+        assert self.law is not None
+        in_force = self.driver.read(self.law.ledger.in_force)
+        in_force[:, -1] = np.array(governor.options)[rule]
+        self.driver.write(self.law.ledger.in_force, in_force)
+
+    def seen(self) -> Float32:
+        """Return what the governor sees of each world, float32 [B, S], see `Governor.sees`."""
+        assert self.game.governor is not None
+        assert self.law is not None
+        read = self.driver.read
+        return self.game.governor.see(
+            read(self.now.stock_left)[:, 0] / len(self.game.map.sites),
+            read(self.now.step)[:, 0],
+            read(self.now.harvested),
+            read(self.law.ledger.counts)[..., VIOLATIONS],
+            self.game.rules.episode_steps,
+        )
+
     def boards(self, output: StepOutput) -> UInt8:
         """Return the current boards as classes of cells (`cprl.commons.cells`): uint8 [B, H, W]."""
         boards = self.driver.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
@@ -237,3 +262,8 @@ class Batch:
             raise ValueError(
                 f"{noun} {choice} of agent {agent} in world {world} is unknown; allowed: {allowed}"
             )
+
+
+def _are_indices(values: Int64, known: int) -> bool:
+    """Return whether all values are in 0 .. known - 1."""
+    return bool((values >= 0).all() and (values < known).all())

@@ -19,7 +19,7 @@ from cprl.commons.spaces import Spaces
 from cprl.commons.tables import Tables, build_tables, check_sizes
 from cprl.commons.world import StepOutput
 from cprl.commons.yields import sustainable_yield
-from cprl.institutions import COUNT_NAMES, Institution, law
+from cprl.institutions import COUNT_NAMES, Governor, Institution, law
 from cprl.institutions.arrays import Form, forms_of
 from cprl.institutions.institution import Ballot
 from cprl.values import Value
@@ -177,6 +177,16 @@ class Game(Value):
         return tuple(ballot for ballot in ballots if ballot is not None)
 
     @property
+    def governor(self) -> Governor | None:
+        """Return the governor among `institutions`; None without one."""
+        return next((one for one in self.institutions if isinstance(one, Governor)), None)
+
+    @property
+    def in_force(self) -> tuple[Ballot, ...]:
+        """Return all that is decided: the ballots, and last what a governor sets."""
+        return self.ballots if self.governor is None else (*self.ballots, self.governor.decided)
+
+    @property
     def decisions(self) -> int:
         """Return the number of options of ("agents", "decision"); 0 if agents decide nothing."""
         return prod(len(ballot.choices) for ballot in self.ballots) if self.ballots else 0
@@ -287,6 +297,7 @@ def output_forms(game: Game, worlds: int) -> dict[str, Form]:
         M=agents * bool(game.map.river),
         L=agents * bool(game.institutions),
         V=len(game.ballots),
+        F=len(game.in_force),
         U=int(paints_over(game.rules.quirks)),
         counts=len(COUNT_NAMES),
     )

@@ -26,7 +26,7 @@ from cprl.institutions.hooks import begin, open_turn, refresh, settle
 from cprl.institutions.ledger import charge, count_violation, forget_episode, forget_turn
 from cprl.institutions.sanctioner import appoint
 from cprl.institutions.sanctions import sanction_violation
-from cprl.institutions.votes import hold_ballot, is_due
+from cprl.institutions.votes import has_governor, hold_ballot, is_due
 from cprl.values.array_types import Int64
 
 if TYPE_CHECKING:
@@ -193,6 +193,7 @@ def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scra
 
 def begin_turn(world: Worlds, law: Law | None, decisions: Int64) -> None:
     """Clear what institutions noted in the last turn; in the first turn of an episode also hold the ballots.
+    Open the windows of this turn again, if a ballot or a governor may have changed a rule.
 
     `decisions`: int64 [N].
     """
@@ -205,7 +206,8 @@ def begin_turn(world: Worlds, law: Law | None, decisions: Int64) -> None:
                 words = draw(world, BALLOT + ballot)
                 hold_ballot(law.votes, law.ledger, ballot, decisions, words)
         appoint(law.sanctioner, law.ledger)
-        open_turn(law, 1, stock_share(world))
+    if world.step[0] == 1 or has_governor(law.votes):
+        open_turn(law, world.step[0], stock_share(world))
 
 
 def end_turn(world: Worlds, law: Law | None) -> None:
@@ -280,4 +282,5 @@ def write_payments(world: Worlds, tables: Tables, law: Law | None, output: StepO
             output.counts[i, count] = ledger.counts[i, count]
     for ballot in range(output.in_force.shape[0]):
         output.in_force[ballot] = ledger.in_force[ballot]
+    for ballot in range(output.ballots_due.shape[0]):
         output.ballots_due[ballot] = world.step[0] == 0 and is_due(law.votes, ballot, world.episode[0])

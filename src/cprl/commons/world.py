@@ -109,9 +109,10 @@ class StepOutput(NamedTuple):
     violated: Annotated[Bool, "B L"]
     counts: Annotated[Int32, "B L counts"]
     """A number for each of `cprl.institutions.COUNT_NAMES`."""
-    in_force: Annotated[Float32, "B V"]
-    """V is the number of ballots."""
+    in_force: Annotated[Float32, "B F"]
+    """F is the number of `Game.in_force`."""
     ballots_due: Annotated[Bool, "B V"]
+    """V is the number of ballots."""
 
 
 class Scratch(NamedTuple):

@@ -46,7 +46,9 @@ _SMALL_OUTPUT_BYTES: Final = 2**16
 a turn of one world."""
 _TURNS_PER_ALLOCATION: Final = 16
 """The number of turns whose small outputs share one allocation."""
-_WRITTEN_ENTRIES: Final = frozenset((*StepOutput._fields, keys.STATE, keys.AGENTS, "next", "_reset"))
+_WRITTEN_ENTRIES: Final = frozenset(
+    (*StepOutput._fields, keys.SEEN, keys.STATE, keys.AGENTS, "next", "_reset")
+)
 """The entries that the environment writes in every turn; all others are carried over from the turn before."""
 
 
@@ -138,8 +140,15 @@ class CommonsEnv(LeanStepEnv):
             name: Categorical(count, shape=self._agents_size, dtype=torch.int64)
             for name, count in choice_counts.items()
         }
-        self.action_spec = self._group_spec(choices)
+        rules = {}
+        if game.governor is not None:
+            options = len(game.governor.options)
+            rules[keys.RULE] = Categorical(options, shape=(self._world_count,), dtype=torch.int64)
+        self.action_spec = self._group_spec(choices, **rules)
         root_specs = self._entry_specs(self._world_entries)
+        if game.governor is not None:
+            seen = self._world_count, len(game.governor.sees)
+            root_specs[keys.SEEN] = Unbounded(shape=seen, dtype=torch.float32)
         if self._has_state:
             board = self._world_count, 3, game.map.height, game.map.width
             root_specs[keys.STATE] = Bounded(0, 255, shape=board, dtype=torch.uint8)
@@ -215,6 +224,8 @@ class CommonsEnv(LeanStepEnv):
         if reward is not None:
             agents["reward"] = reward
         entries: dict[str, Any] = {name: tensors[name] for name in (*self._world_entries, *_DONE_ENTRIES)}
+        if self.game.governor is not None:
+            entries[keys.SEEN] = torch.as_tensor(self.worlds.seen(), device=self.device)
         if self._has_state:
             boards = torch.as_tensor(self.worlds.boards(self.output), device=self.device)
             entries[keys.STATE] = self._colours[boards.long()].permute(0, 3, 1, 2)
@@ -302,6 +313,9 @@ class CommonsEnv(LeanStepEnv):
         step_mask = tensordict.get("_step", None)
         if step_mask is not None:
             self._check_step_mask(step_mask.reshape(-1))
+        rule = None if self.game.governor is None else tensordict.get(keys.RULE, None)
+        if rule is not None:
+            self.worlds.put_in_force(rule.numpy(force=True))
         self._set_output(*self._new_output())
         self.worlds.play(actions, self.output, decisions)
         return self._as_tensordict(self._tensors, self._tensors["reward"].unsqueeze(-1))

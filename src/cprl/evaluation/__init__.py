@@ -2,13 +2,12 @@
 
 Modules, in the order in which one reads them:
     populations     play_population: stored and scripted agents play; their episodes become a table
-    pages           the printed tables and the drawn matrices that several kinds of evaluation share
+    pages           the printed tables that several kinds of evaluation share
     evaluate        evaluate_run: all replicas of a run, compared with the random policy
     cross_play      crossplay: one focal agent of a run among background agents of another run
     scenarios       run_scenarios: agents of a run among named backgrounds that they never met
     fresh           one fresh episode of a run to be filmed or shown, by default a typical one
     film            an episode as a recording for the viewer, or as a GIF or MP4
-    film_pictures   the pictures of a film, and the writing of its file
     play            an episode in which a person plays among trained or scripted agents
 """
 

@@ -18,8 +18,7 @@ from typing import Final
 
 import pyarrow as pa
 
-from cprl.evaluation.evaluate import as_loaded, refuse_other_games
-from cprl.evaluation.pages import draw_matrices, heading, matrix_table, row_table
+from cprl.evaluation.pages import heading, matrix_labels, matrix_table, row_table
 from cprl.evaluation.populations import (
     AgentOfReplica,
     agents_of,
@@ -35,9 +34,10 @@ from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, Label, all_metri
 from cprl.system.defaults import Diagonal, Fresh
 from cprl.system.working import working
 from cprl.terminal import style
+from cprl.terminal.panels import draw_matrix, matrix_height
 from cprl.terminal.summary import is_empty_row, rewards_of
 from cprl.terminal.text_tables import TextTable
-from cprl.training.stored import LoadedRun
+from cprl.training.stored import LoadedRun, as_loaded, refuse_other_games
 from cprl.values import checked, refusal
 
 _SELF_PLAY: Final = -1
@@ -176,24 +176,27 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
     from 0 by Holm's method for all drawn gains.
     """
     gained = gains(table)
-    returns = estimates(table, FOCAL_RETURN, PAIR)
-    texts = {
-        pair: f"{returns[(*pair, FOCAL_RETURN)].value:.3g}" for pair in returns.labels if pair[0] == pair[1]
-    }
+    returns = estimates(table, FOCAL_RETURN, PAIR).column(FOCAL_RETURN)
+    texts = {pair: f"{returns[pair].value:.3g}" for pair in returns if pair[0] == pair[1]}
     unit = f", {rewards_of(table)}".removesuffix(", ")
     diagonal = table_note(table, "diagonal").replace("_", "-")
-    return draw_matrices(
-        path,
-        gained,
-        _GAINS,
-        title="Cross-play: who gains among whom",
-        caption=(
+    rows, columns = (dict(zip(labels, labels, strict=True)) for labels in matrix_labels(gained))
+    with style.drawing(path, width=width, colours=style.PNG_SHADES) as sheet:
+        panels = sheet.panels(len(_GAINS), high=matrix_height(len(rows)))
+        for axes, (metric, panel_title) in zip(panels, _GAINS.items(), strict=True):
+            values = {}
+            for pair, estimate in gained.column(metric).items():
+                values[pair] = estimate.value
+                texts[pair] = f"{estimate.value:+.3g}" + " *" * estimate.differs
+            draw_matrix(sheet, axes, rows, columns, values, texts)
+            axes.set(xlabel=BACKGROUND, ylabel=FOCAL)
+            axes.set_title(panel_title)
+        sheet.title = "Cross-play: who gains among whom"
+        sheet.caption = (
             f"Difference in return{unit}; {table_note(table, 'fresh')} with focal agent at each index; "
             f"diagonal ({diagonal}): an agent's return. {HOLM_NOTE} for these {len(gained)}."
-        ),
-        other_cells=texts,
-        width=width,
-    )
+        )
+    return Path(path)
 
 
 def crossplay_tables(table: pa.Table) -> Iterator[TextTable]:

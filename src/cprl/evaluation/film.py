@@ -1,27 +1,21 @@
 """Films an episode of stored agents: as a recording for the viewer, or as a GIF or MP4 of several runs."""
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import dataclass
-from itertools import pairwise
+from importlib.util import find_spec
+from itertools import chain, pairwise
 from math import ceil
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
+from PIL import Image
+from scipy.spatial.distance import cdist
 
-from cprl import keys
 from cprl.envs.unwrap import commons_of
-from cprl.evaluation.film_pictures import (
-    DEFAULT_WIDTH,
-    LARGEST_WIDTH,
-    SMALLEST_WIDTH,
-    EpisodePicture,
-    check_can_write_mp4,
-    note,
-    write_gif,
-    write_mp4,
-)
 from cprl.evaluation.fresh import (
     FreshEpisode,
     Recorded,
@@ -33,14 +27,21 @@ from cprl.evaluation.populations import commons_game
 from cprl.measuring.playing import turns
 from cprl.measuring.series import Observer
 from cprl.measuring.tracker import Episode, tracker_of
+from cprl.pictures.episode_picture import (
+    DEFAULT_WIDTH,
+    LARGEST_WIDTH,
+    SMALLEST_WIDTH,
+    EpisodePicture,
+    note,
+)
 from cprl.pictures.readable import capitalised, growth_of, in_lower_case, legend_of
-from cprl.runs.files import refuse_to_write_over
+from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.defaults import FILM_SUFFIXES
 from cprl.system.output import legible
 from cprl.system.working import working
 from cprl.training.stored import LoadedRun
 from cprl.values import Positive, Range, Value, Where, checked, refusal
-from cprl.values.array_types import Bool, UInt8
+from cprl.values.array_types import UInt8
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.replay_views import Decisions, ViolationMarks, events
 
@@ -83,23 +84,22 @@ def film(
     refuse_to_write_over(target)
     print_descriptions([fresh])
     target.parent.mkdir(parents=True, exist_ok=True)
-    title = f"{legible(Path(run).name)}, replica {fresh.replica}, episode {fresh.episode}"
     try:
-        return target, _record_to_file(fresh, target, title)
+        return target, _record_to_file(fresh, target)
     except BaseException:  # the next attempt would refuse to overwrite the recording of half an episode
         target.unlink(missing_ok=True)
         raise
 
 
 @working("playing an episode")
-def _record_to_file(fresh: FreshEpisode, target: Path, title: str) -> Episode:
+def _record_to_file(fresh: FreshEpisode, target: Path) -> Episode:
     """Play an episode and record all its turns."""
     env = fresh.env
     commons = commons_of(env)
     with ViewerCallback(
         target.parent,
         env,
-        title=title,
+        title=f"{legible(fresh.run.path.name)}, replica {fresh.replica}, episode {fresh.episode}",
         episodes=1,
         recipe=fresh.run.recipe,
         file_name=target.name,
@@ -204,10 +204,7 @@ def film_video(
     if path.suffix not in FILM_SUFFIXES:
         raise refusal("out", str(path), f"a file whose name ends in {' or '.join(FILM_SUFFIXES)}")
     runs = (run, *beside)
-    most_runs = LARGEST_WIDTH // SMALLEST_WIDTH
-    if len(runs) > most_runs:
-        raise refusal("beside", f"{len(runs) - 1} runs", f"at most {most_runs - 1}")
-    check_titles(style.titles, len(runs))
+    check_beside(runs, style.titles, most=LARGEST_WIDTH // SMALLEST_WIDTH)
     width = style.width_of_each(len(runs))
     refuse_to_write_over(path)
     if path.suffix == ".mp4":
@@ -240,10 +237,12 @@ def film_video(
     return path, tuple(panel.played.episode for panel in panels)
 
 
-def check_titles(titles: Sequence[str], runs: int) -> None:
-    """Refuse titles unless they are one printable line for each run; no titles are allowed too."""
-    if titles and (len(titles) != runs or not all(map(str.isprintable, titles))):
-        raise refusal("titles", titles, f"a line of text for each of {runs} runs")
+def check_beside(runs: Sequence[str | Path], titles: Sequence[str], *, most: int) -> None:
+    """Refuse more than `most` runs, and titles, if there are any, unless each run has a printable line."""
+    if len(runs) > most:
+        raise refusal("beside", f"{len(runs) - 1} runs", f"at most {most - 1}")
+    if titles and (len(titles) != len(runs) or not all(map(str.isprintable, titles))):
+        raise refusal("titles", titles, f"a line of text for each of {len(runs)} runs")
 
 
 def titles_of(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
@@ -274,8 +273,6 @@ class _Panel(NamedTuple):
     title: str
     picture: EpisodePicture
     played: Recorded
-    violated: Bool
-    """bool [T + 1, N], the agents that broke a rule in the turn before each board."""
     is_typical: bool
     """Whether the episode was chosen as a typical one."""
 
@@ -302,7 +299,7 @@ class _Panel(NamedTuple):
             comes_to=f"{subject}: {apples}, {outcome}",
             end=end,
             card=card_text,
-            violators=np.flatnonzero(self.violated[since : turn + 1].any(0)).tolist(),
+            violators=np.flatnonzero(played.violated[since : turn + 1].any(0)).tolist(),
         )
 
 
@@ -316,6 +313,74 @@ def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) ->
     panels = []
     for title, population, game, played in zip(titles, fresh, games, episodes, strict=True):
         picture = EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes)
-        violated = played.since_the_start("next", *keys.VIOLATED) > 0
-        panels.append(_Panel(title, picture, played, violated, population.is_typical))
+        panels.append(_Panel(title, picture, played, population.is_typical))
     return panels
+
+
+HOLD_S: Final = 2.0
+"""The seconds for which the last picture is shown."""
+
+_GIF_COLOURS: Final = 127
+"""The number of colours in a GIF. With one more for unchanged pixels, a pixel takes at most seven bits."""
+
+
+def check_can_write_mp4(path: Path) -> None:
+    """Raise a ModuleNotFoundError with the command to install imageio-ffmpeg if it is not installed."""
+    if find_spec("imageio_ffmpeg") is None:
+        raise ModuleNotFoundError(
+            f"{path}: an .mp4 needs imageio-ffmpeg, which is not installed; "
+            'run pip install "cprl[film]", or name a .gif'
+        )
+
+
+def write_gif(path: Path, pictures: Iterable[UInt8], samples: Sequence[UInt8], *, fps: float) -> None:
+    """Write a GIF that repeats, with one palette for all pictures.
+
+    Args:
+        pictures: the pictures, uint8 [height, width, 3] each, RGB.
+        samples: some of the pictures, whose most frequent colours are the palette; any other colour becomes
+            the nearest of these.
+        fps: the pictures per second, rounded so that a picture lasts whole hundredths of a second.
+    """
+    counts: Any = Image.fromarray(np.concatenate(samples)).getcolors(2**24)
+    known = np.array([colour for _, colour in sorted(counts, reverse=True)[:_GIF_COLOURS]])
+    palette = known.astype(np.uint8).tobytes() + bytes(3)
+    index = np.full(2**24, -1, np.int16)
+
+    def indexed(picture: UInt8) -> Image.Image:
+        # Pillow's own quantize treats colours as equal that differ by up to 4.
+        packed = picture @ np.array([1 << 16, 1 << 8, 1], np.int32)
+        new = np.unique(packed[index[packed] < 0])
+        index[new] = cdist(np.stack([new >> 16, new >> 8 & 255, new & 255], -1), known).argmin(1)
+        image = Image.fromarray(index[packed].astype(np.uint8), "P")
+        image.putpalette(palette)
+        return image
+
+    first, *others = map(indexed, pictures)
+    options = {
+        "append_images": others,
+        "duration": [10 * max(2, round(100 / fps))] * len(others) + [round(1000 * HOLD_S)],
+        "palette": palette,
+        "transparency": len(known),
+    }
+    write_atomically(
+        path, lambda file: first.save(file, format="GIF", save_all=True, loop=0, optimize=True, **options)
+    )
+
+
+def write_mp4(path: Path, pictures: Iterator[UInt8], *, fps: float) -> None:
+    """Write an MP4, whose last picture is shown for `HOLD_S` seconds."""
+    from imageio_ffmpeg import write_frames
+
+    look: Any = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
+    first = next(pictures)
+    height, width, _ = first.shape
+    with TemporaryDirectory() as folder:
+        partial = Path(folder) / "film.mp4"
+        with closing(write_frames(partial, (width, height), fps=fps, **look)) as video:
+            video.send(None)
+            for picture in chain([first], pictures):
+                video.send(np.ascontiguousarray(picture))
+            for _ in range(round(HOLD_S * fps) - 1):
+                video.send(np.ascontiguousarray(picture))
+        write_atomically(path, lambda file: file.write(partial.read_bytes()))

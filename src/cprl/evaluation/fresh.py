@@ -18,7 +18,6 @@ from cprl import keys
 from cprl.commons.world import WorldView
 from cprl.envs.commons_env import CommonsEnv
 from cprl.envs.unwrap import commons_of
-from cprl.evaluation.evaluate import as_loaded
 from cprl.evaluation.populations import refuse_trained_in
 from cprl.measuring.playing import evaluate, turns
 from cprl.measuring.registry import COLLECTIVE_RETURN
@@ -32,8 +31,9 @@ from cprl.runs.played import TURNS
 from cprl.system.defaults import FILM_SEED
 from cprl.system.output import say
 from cprl.system.working import working
-from cprl.training.stored import LoadedRun
+from cprl.training.stored import LoadedRun, as_loaded
 from cprl.values import Natural, Range, Seed, checked, refusal
+from cprl.values.array_types import Bool
 
 EPISODES_TRIED: Final = 5
 """The number of fresh episodes from which a typical one is chosen."""
@@ -155,21 +155,18 @@ def fresh_episodes(
 
 def _typical_episodes(runs: Sequence[LoadedRun], seed: int) -> list[FreshEpisode]:
     """Return episodes of the runs' typical replicas in the world that is nearest to their medians."""
-    replicas = [typical_replica(run) for run in runs]
-    has_averages = [bool(averages_of(run)) for run in runs]
 
     def episodes_in_world(world: int) -> list[FreshEpisode]:
         return [
-            _fresh(run, replica, world, seed)._replace(is_typical=is_typical)
-            for run, replica, is_typical in zip(runs, replicas, has_averages, strict=True)
+            _fresh(run, typical_replica(run), world, seed)._replace(is_typical=bool(averages_of(run)))
+            for run in runs
         ]
 
     def distance(world: int) -> float:
         return sum(_distance(fresh) for fresh in episodes_in_world(world) if fresh.is_typical)
 
-    if not any(has_averages):
-        return episodes_in_world(0)
-    return episodes_in_world(min(range(EPISODES_TRIED), key=distance))
+    tried = EPISODES_TRIED if any(map(averages_of, runs)) else 1
+    return episodes_in_world(min(range(tried), key=distance))
 
 
 def fresh_seed(runs: Sequence[LoadedRun], first: int = FILM_SEED) -> int:
@@ -187,13 +184,8 @@ def typical_replica(run: LoadedRun) -> int:
     averages = averages_of(run)
     if not averages:
         return run.replicas[0]
-    median_turns, median_apples = _median(averages)
-
-    def distances(replica: int) -> tuple[float, float]:
-        turns, apples = averages[replica]
-        return abs(turns - median_turns), abs(apples - median_apples)
-
-    return min(averages, key=distances)
+    median = _median(averages)
+    return min(averages, key=lambda replica: np.abs(np.subtract(averages[replica], median)).tolist())
 
 
 def _fresh(run: LoadedRun, replica: int | None, episode: int, seed: int) -> FreshEpisode:
@@ -277,6 +269,12 @@ class Recorded(NamedTuple):
     def is_dead(self) -> bool:
         """Return whether the board died: no apple was left and none could grow."""
         return self.episode.terminated and self.left == 0
+
+    @property
+    def violated(self) -> Bool:
+        """Return who broke a rule in the turn before each board, bool [T + 1, N]."""
+        violated: Bool = self.since_the_start("next", *keys.VIOLATED) > 0
+        return violated
 
     def since_the_start(self, *key: str) -> Any:
         """Return an entry of agents after each turn, with zeros for the start, [T + 1, N].

@@ -1,13 +1,10 @@
-"""The printed tables and the drawn matrices that several kinds of evaluation share."""
+"""The printed tables that several kinds of evaluation share."""
 
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+from collections.abc import Iterable
 
 from cprl.measuring.registry import with_unit
 from cprl.measuring.statistics import Family, notes_on
 from cprl.system.defaults import Fresh
-from cprl.terminal import style
-from cprl.terminal.panels import draw_matrix, matrix_height
 from cprl.terminal.summary import OVER_REPLICAS
 from cprl.terminal.text_tables import Change, TableCell, TextTable
 from cprl.training.stored import LoadedRun
@@ -51,7 +48,7 @@ def matrix_table(family: Family, metric: str, title: str, note: str = "") -> Tex
     Args:
         note: the text below the matrix; by default the notes on its estimates.
     """
-    row_labels, column_labels = _matrix_labels(family)
+    row_labels, column_labels = matrix_labels(family)
     estimates = family.column(metric)
     cells = {pair: Change(estimate) if family.name else estimate for pair, estimate in estimates.items()}
     rows: list[list[TableCell]] = []
@@ -62,40 +59,7 @@ def matrix_table(family: Family, metric: str, title: str, note: str = "") -> Tex
     return TextTable(title, head, rows, note or "\n".join(notes_on(estimates.values())))
 
 
-def _matrix_labels(family: Family) -> tuple[list[str], list[str]]:
+def matrix_labels(family: Family) -> tuple[list[str], list[str]]:
     """Return the labels of rows and of columns, in the same order if they are the same labels."""
     rows, columns = (list(dict.fromkeys(labels)) for labels in zip(*family.labels, strict=True))
     return rows, rows if set(rows) == set(columns) else columns
-
-
-def draw_matrices(
-    path: Path | str,
-    family: Family,
-    titles: Mapping[str, str],
-    *,
-    title: str,
-    caption: str,
-    other_cells: Mapping[tuple[str, str], str],
-    width: style.Width,
-) -> Path:
-    """Draw metrics of a family with two labels, one matrix for each; a star marks significant differences.
-
-    Args:
-        titles: the title of each matrix, by its metric.
-        other_cells: the texts of cells for which the family has no estimate.
-    """
-    rows, columns = (dict(zip(labels, labels, strict=True)) for labels in _matrix_labels(family))
-    with style.drawing(path, width=width, colours=style.PNG_SHADES) as sheet:
-        panels = sheet.panels(len(titles), high=matrix_height(len(rows)))
-        for axes, (metric, panel_title) in zip(panels, titles.items(), strict=True):
-            values = {}
-            texts = {}
-            for pair, estimate in family.column(metric).items():
-                values[pair] = estimate.value
-                texts[pair] = f"{estimate.value:+.3g}" + " *" * estimate.differs
-            draw_matrix(sheet, axes, rows, columns, values, {**texts, **other_cells})
-            axes.set(xlabel=family.by[1], ylabel=family.by[0])
-            axes.set_title(panel_title)
-        sheet.title = title
-        sheet.caption = caption
-    return Path(path)

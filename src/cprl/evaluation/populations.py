@@ -23,7 +23,7 @@ from cprl.measuring.playing import evaluate
 from cprl.measuring.table import BACKGROUND, FOCAL, ROLE, Label, complete, labelled, store_agent_names
 from cprl.policies.joint_policy import JointPolicy
 from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedPolicy
-from cprl.population import AgentSpec, Frozen, Scripted, specs_by_agent
+from cprl.population import AgentSpec, Frozen, Language, Scripted, specs_by_agent
 from cprl.runs.episodes import table_of
 from cprl.system.defaults import Fresh
 from cprl.system.output import legible
@@ -76,6 +76,10 @@ class FreshGame:
     def playing(self) -> Game | Spaces:
         """Return the game or the spaces for which policies are made, as `LoadedRun.playing`."""
         return self.game if isinstance(self.game, Game) else spaces_of(self.env())
+
+    def governor(self, replicas: Sequence[int]) -> list[StoredAgent]:
+        """Return no governor: the first option of one in the game stays in force."""
+        return []
 
     def env(self, worlds: int = 1, *, seed: int = 0, first_world: int = 0) -> EnvBase:
         """Return an environment with fresh worlds of the game."""
@@ -155,7 +159,14 @@ def policies_of(
 ) -> JointPolicy:
     """Return the joint policy of all agents in the lanes of these replicas."""
     stored = [list(map(agent, replicas)) for agent in agents]
-    return stored_policies(stored, place.playing, replicas=replicas, worlds=fresh.episodes, seed=fresh.seed)
+    return stored_policies(
+        stored,
+        place.playing,
+        replicas=replicas,
+        worlds=fresh.episodes,
+        seed=fresh.seed,
+        governor=place.governor(replicas),
+    )
 
 
 def play_fresh(
@@ -247,7 +258,7 @@ def play_population(where: Any, agents: Sequence[AgentSpec], fresh: Fresh = Fres
 
     Args:
         where: a game; or a run, a value of `cprl.load`, whose game and transforms are used.
-        agents: the specification of each agent, `Scripted` or `Frozen`. In replica r,
+        agents: the specification of each agent, `Scripted`, `Language` or `Frozen`. In replica r,
             `Frozen(run, agent, replica=None)` is the agent of the run's replica r.
         fresh: the number of episodes, their seed, and the replicas that play. With the same seed all
             populations play in the same worlds.
@@ -266,10 +277,10 @@ def fresh_of_specs(specs: Sequence[AgentSpec], fresh: Fresh) -> Fresh:
 
 
 def agents_specified(place: Place, specs: Sequence[AgentSpec], fresh: Fresh) -> list[AgentOfReplica]:
-    """Return the agents that specifications describe; refuse others than `Scripted` and `Frozen`."""
+    """Return the agents that specifications describe; refuse those that learn, and people."""
     for agent, spec in enumerate(specs_by_agent(specs, place.game.agents)):
-        if not isinstance(spec, Scripted | Frozen):
-            allowed = "Scripted(policy) or Frozen(run, agent, replica)"
+        if not isinstance(spec, Scripted | Language | Frozen):
+            allowed = "Scripted(policy), Language(model) or Frozen(run, agent, replica)"
             raise ValueError(f"agents[{agent}] is a {type(spec).__name__}; allowed: {allowed}")
     agents_by_replica: list[dict[int, StoredAgent]] = [{} for _ in range(place.game.agents)]
     for group in consecutive_groups(fresh.replicas):

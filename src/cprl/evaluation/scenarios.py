@@ -21,7 +21,6 @@ import pyarrow as pa
 
 from cprl.commons.game import Game
 from cprl.evaluation.cross_play import BACKGROUND_RETURN, FOCAL_RETURN
-from cprl.evaluation.evaluate import as_loaded, refuse_other_games, refuse_unlike
 from cprl.evaluation.pages import heading, row_table
 from cprl.evaluation.populations import (
     AgentOfReplica,
@@ -46,7 +45,7 @@ from cprl.terminal.panels import draw_dots
 from cprl.terminal.summary import OVER_REPLICAS
 from cprl.terminal.text_tables import Change, TableCell, TextTable
 from cprl.training.agents import check_scripted
-from cprl.training.stored import LoadedRun, load
+from cprl.training.stored import LoadedRun, as_loaded, load, refuse_other_games, refuse_unlike
 from cprl.values import Value, Where, refusal
 
 Focal: TypeAlias = Literal["majority", "minority"]
@@ -225,16 +224,13 @@ def run_scenarios(
                 labels = {"scenario": scenario.name, FOCAL: name, "focal_agents": indices}
                 yield play_fresh(fresh, loaded, agents, labels, roles=roles_of(count, placement))
 
-    played_names = {scenario.name for scenario in chosen}
-    all_names = {scenario.name for scenario in scenarios_of(loaded.game)}
-    missing = left_out_of(loaded.game) if played_names >= all_names else ""
     return join_tables(
         placement_tables(),
         heading=heading(f"Scenarios of {loaded.path.name}", fresh, [loaded], " in each placement"),
         run=loaded.path.name,
         fresh=fresh,
         weights=loaded.weights_from,
-        scenarios_left_out=missing,
+        scenarios_left_out="" if scenarios else left_out_of(loaded.game),
     )
 
 
@@ -244,9 +240,8 @@ def _load_background_runs(run: LoadedRun, scenarios: Sequence[Scenario]) -> dict
     for scenario in scenarios:
         for spec in scenario.background:
             if isinstance(spec, Frozen) and spec.run not in background_runs:
-                background_runs[spec.run] = load(spec.run)
-    for path, background_run in background_runs.items():
-        refuse_other_games({str(run.path): run, f"the background {path}": background_run})
+                background_run = background_runs[spec.run] = load(spec.run)
+                refuse_other_games({str(run.path): run, f"the background {spec.run}": background_run})
     return background_runs
 
 

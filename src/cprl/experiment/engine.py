@@ -39,8 +39,11 @@ def planned_turns(experiment: "Experiment") -> int:
 def planned_updates(experiment: "Experiment") -> int:
     """Return the updates of each replica, for the agents with the most, if no episode ends early."""
     steps = planned_steps(experiment)
-    learning = [spec.algorithm for spec in experiment.agents if isinstance(spec, Learning | Team)]
-    return max((_updates_by(algorithm, steps, experiment.worlds) for algorithm in learning), default=0)
+    algorithms: list[Any] = []
+    for spec in experiment.agents:
+        if isinstance(spec, Learning | Team) and spec.algorithm not in algorithms:
+            algorithms.append(spec.algorithm)
+    return max((_updates_by(algorithm, steps, experiment.worlds) for algorithm in algorithms), default=0)
 
 
 def _updates_by(algorithm: Any, steps: int, worlds: int) -> int:
@@ -56,8 +59,9 @@ def _settings_of(algorithm: Any) -> Any:
     """Return the settings of an algorithm as its recipe holds them, so that a custom one has the same before
     and after it is stored; None without settings of cprl."""
     table = to_config(algorithm)
-    settings = table["arguments"] if table["kind"] == "Custom" else table
-    settings = settings.get("settings")
+    if table["kind"] != "Custom":
+        return getattr(algorithm, "settings", None)
+    settings = table["arguments"].get("settings")
     if not is_value(settings):
         return None
     try:

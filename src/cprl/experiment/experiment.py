@@ -14,9 +14,11 @@ from cprl.experiment.engine import Engine, engine_of
 from cprl.measuring.tracker import check_custom_metrics
 from cprl.objectives.rewards import check_reward
 from cprl.pictures.readable import game_html
+from cprl.policies.governors import Script
 from cprl.population import (
     AgentSpec,
     Frozen,
+    GovernorSpec,
     Learning,
     Team,
     has_people,
@@ -34,6 +36,7 @@ from cprl.values import (
     MOST_INT64,
     Custom,
     DirectoryName,
+    Natural,
     Positive,
     Range,
     Steps,
@@ -82,6 +85,13 @@ class Experiment(Value, stored=False, called="experiment"):
     """The game that is played: in training, after those of `earlier`, in evaluations and afterwards."""
     agents: tuple[AgentSpec, ...]
     """The specification of each agent; see `cprl.population`."""
+    governor: GovernorSpec | None = None
+    """How the game's `Governor` decides: `Learning` with an algorithm of one agent, whose settings count
+    periods where they count steps; a `StockRule` or a `Constant`; or `Frozen`, which names it as the agent
+    after the last of its run. None leaves the first option in force."""
+    governor_from_step: Natural = 0
+    """The steps of each replica before the governor decides and learns; until then its first option is in
+    force, so that agents learn first."""
     episodes: Positive | None = None
     """Episodes that each replica trains, in all its worlds together; None with `steps`."""
     steps: Annotated[int, Range(1, MOST_INT64)] | None = None
@@ -178,6 +188,11 @@ class Experiment(Value, stored=False, called="experiment"):
         return Length.of(vars(self), clock)
 
     @property
+    def specs(self) -> tuple[AgentSpec | GovernorSpec, ...]:
+        """Return the specifications of all agents, and last that of the governor, if it has one."""
+        return self.agents if self.governor is None else (*self.agents, self.governor)
+
+    @property
     def schedule(self) -> Schedule:
         """Return the length, the worlds of each replica, and how often its agents learn."""
         return Schedule(**{name: getattr(self, name) for name in hints_of(Schedule)})
@@ -193,6 +208,7 @@ class Experiment(Value, stored=False, called="experiment"):
         _check_numbers(self)
         _check_earlier(self)
         _check_agents(self, self.schedule)
+        _check_governor(self)
         _check_engine(self)
 
     def to_config(self) -> dict[str, Any]:
@@ -305,6 +321,33 @@ def _check_agents(experiment: Experiment, schedule: Schedule) -> None:
                 raise ValueError(f"{where}.algorithm.settings: {error}") from error
         rollout_steps = getattr(settings, "rollout_steps", schedule.update_every)
         schedule.refuse_rollouts(rollout_steps, f"{where}.algorithm.settings.rollout_steps")
+
+
+def _check_governor(experiment: Experiment) -> None:
+    spec = experiment.governor
+    if spec is None:
+        if experiment.governor_from_step:
+            raise ValueError(
+                f"experiment.governor_from_step is {experiment.governor_from_step}; allowed without a "
+                "governor: 0"
+            )
+        return
+    for index, game in enumerate([experiment.game, *(part.game for part in experiment.earlier)]):
+        if not isinstance(game, Game) or game.governor is None:
+            which = f"experiment.earlier[{index - 1}].game" if index else "experiment.game"
+            raise ValueError(f"experiment.governor is {spec}; allowed in {which} without a Governor: None")
+        if isinstance(spec, Script):
+            spec.check(game.governor)
+    if isinstance(spec, Learning) and spec != Learning(spec.algorithm):
+        raise ValueError(f"experiment.governor is {spec}; allowed for a governor: Learning(algorithm) alone")
+    if isinstance(spec, Frozen):
+        _check_stored("experiment.governor", spec, experiment.replicas)
+    settings: Any = getattr(getattr(spec, "algorithm", None), "settings", None)
+    if hasattr(settings, "refuse_worlds"):
+        try:
+            settings.refuse_worlds(experiment.worlds)
+        except ValueError as error:
+            raise ValueError(f"experiment.governor.algorithm.settings: {error}") from error
 
 
 def _check_stored(where: str, stored: Frozen, replicas: int) -> None:

@@ -11,6 +11,7 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl.policies.decisions import Decider
+from cprl.policies.governors import GovernorActor
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.rng import Purpose
 from cprl.system.compat.tensordicts import unchecked_tensordict
@@ -56,6 +57,7 @@ class CurrentPolicy:
         others: the actors of the agents that do not learn, for one world of the first replica.
         decisions: two deciders: one without exploration and with its own random numbers, for one world of the
             first replica; and that of the training. None in a game without decisions.
+        governor: decides for one world, by its current weights; None without one.
         replicas: the number of replicas R.
         device: the device whose generator is left unchanged, besides that of the CPU.
     """
@@ -66,13 +68,14 @@ class CurrentPolicy:
         others: Mapping[ActorAgents, nn.Module],
         *,
         decisions: tuple[Decider, Decider] | None = None,
+        governor: GovernorActor | None = None,
         replicas: int,
         device: torch.device | None = None,
     ) -> None:
         self._decisions = decisions
         current_decisions = None if decisions is None else decisions[0]
         first = {agents: FirstReplica(current, replicas) for agents, (current, _) in learned.items()}
-        self._policy = JointPolicy({**first, **others}, decisions=current_decisions)
+        self._policy = JointPolicy({**first, **others}, decisions=current_decisions, governor=governor)
         self._pairs = [
             (current, training)
             for current, training in learned.values()
@@ -129,6 +132,7 @@ def current_policy(population: Population) -> CurrentPolicy:
             actors,
             population.other_actors(Purpose.EXHIBITION, worlds=1, replicas=1),
             decisions=decisions,
+            governor=None if population.governor is None else population.governor.evaluation_actor(1),
             replicas=population.replicas,
             device=population.device,
         )

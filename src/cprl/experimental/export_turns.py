@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from cprl import keys
 from cprl.commons.game import Game
-from cprl.evaluation.evaluate import as_loaded
 from cprl.evaluation.fresh import Recorded, fresh_episodes, record
 from cprl.evaluation.populations import refuse_trained_in
 from cprl.runs.files import refuse_to_write_over, write_atomically
 from cprl.system.defaults import FILM_SEED as SEED
 from cprl.system.output import say
 from cprl.system.working import note_progress, working
+from cprl.training.stored import as_loaded
 from cprl.values import Positive, checked
 from cprl.values.array_types import Int64, UInt8
 

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from cprl.commons.cells import APPLE, GROUND, WALL
 from cprl.commons.maps import Map
-from cprl.evaluation.evaluate import as_loaded
 from cprl.evaluation.pages import heading
 from cprl.evaluation.populations import (
     agents_of,
@@ -35,7 +34,7 @@ from cprl.system.defaults import Fresh
 from cprl.system.working import working
 from cprl.terminal import style
 from cprl.terminal.text_tables import TextTable
-from cprl.training.stored import LoadedRun
+from cprl.training.stored import LoadedRun, as_loaded
 from cprl.values import checked, refusal
 from cprl.values.array_types import Float64
 

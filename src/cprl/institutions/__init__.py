@@ -21,6 +21,7 @@ Modules in reading order:
     rotation     Rotation: agents harvest in turn
     taxes        Tax on the harvest, and Levies of nested groups
     votes        Vote on a tax or a quota, and how ballots are held
+    governor     Governor: sets the number of a tax or a quota every few turns
     monitoring   Monitoring: violations are detected by chance, at a cost
     sanctions    GraduatedSanctions: time-outs and fines that grow with the offences
     mediation    Mediation: unjust tags are refunded
@@ -47,6 +48,7 @@ from cprl.institutions import (
     votes,
 )
 from cprl.institutions.boundaries import Boundaries
+from cprl.institutions.governor import Governor
 from cprl.institutions.institution import Institution
 from cprl.institutions.ledger import COUNT_NAMES, Entries, Ledger
 from cprl.institutions.mediation import Mediation
@@ -90,6 +92,7 @@ __all__ = [
     "Boundaries",
     "ClosedPatches",
     "ClosedSeason",
+    "Governor",
     "GraduatedSanctions",
     "Institution",
     "Law",

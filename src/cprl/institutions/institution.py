@@ -26,7 +26,7 @@ class Ballot(NamedTuple):
     is_election: bool
     """Whether the choice with most votes wins; otherwise the median of the decisions does."""
     period_episodes: int
-    """The ballot is held at the first of every such number of episodes."""
+    """The ballot is held at the first of every such number of episodes; 0 for what a governor sets."""
     override_prob: float
     """The probability that the result is drawn by chance, whatever agents decide."""
 
@@ -117,12 +117,14 @@ Kind = TypeVar("Kind", bound=Institution)
 
 
 def with_ballots(game: Any, kind: type[Kind]) -> list[tuple[Kind, int]]:
-    """Return the institutions of a kind in a game, each with the index of its ballot, or -1.
+    """Return the institutions of a kind in a game, each with the index in `Game.in_force` of what is decided
+    about it, or -1.
 
     An institution that is voted on counts as one of its kind.
     """
+    governed = None if game.governor is None else game.governor.governed(game)
     return [
-        (institution.rule, ballot if institution.ballot(game.agents) else -1)
+        (institution.rule, ballot if institution.ballot(game.agents) or institution is governed else -1)
         for institution, ballot in numbered(game)
         if isinstance(institution.rule, kind)
     ]
@@ -144,10 +146,13 @@ def columns(kind: type[Kind], arrays: Any, game: Any) -> dict[str, Any]:
 
 
 def numbered(game: Any) -> Iterator[tuple[Institution, int]]:
-    """Yield the institutions of a game, each with the number of ballots before it: the index of its own."""
+    """Yield the institutions of a game, each with the number of ballots before it: the index of its own. A
+    governor, and what it governs, come after all ballots."""
     ballots = 0
+    governor = game.governor
+    last = () if governor is None else (governor, governor.governed(game))
     for institution in game.institutions:
-        yield institution, ballots
+        yield institution, len(game.ballots) if any(institution is each for each in last) else ballots
         ballots += institution.ballot(game.agents) is not None
 
 

@@ -8,6 +8,7 @@ from typing import Any, Final, cast
 
 from cprl.institutions import Law
 from cprl.institutions.arrays import filled
+from cprl.institutions.governor import Governor
 from cprl.institutions.institution import Institution, columns, numbered
 from cprl.institutions.ledger import COUNT_NAMES, Ledger
 from cprl.institutions.votes import MOST_DECISIONS
@@ -20,11 +21,14 @@ MODULES: Final = {
 """The modules of institutions by their fields in `Law`, which have the names of the modules."""
 
 
-INSTITUTION_KINDS: Final[tuple[type[Institution], ...]] = tuple(
-    kind
-    for module in MODULES.values()
-    for kind in vars(module).values()
-    if isinstance(kind, type) and issubclass(kind, Institution) and kind.__module__ == module.__name__
+INSTITUTION_KINDS: Final[tuple[type[Institution], ...]] = (
+    *(
+        kind
+        for module in MODULES.values()
+        for kind in vars(module).values()
+        if isinstance(kind, type) and issubclass(kind, Institution) and kind.__module__ == module.__name__
+    ),
+    Governor,
 )
 """The classes of all institutions that a game can have."""
 
@@ -73,9 +77,9 @@ def _parameters(module: Any, game: Any) -> dict[str, Any]:
 def new_law(game: Any, worlds: int) -> Law:
     """Return the arrays of a game's institutions for B worlds in which nothing has happened yet.
 
-    The first choice of each ballot is in force.
+    The first choice of each ballot, and the first option of a governor, is in force.
     """
-    sizes = {"B": worlds, "N": game.agents, "C": len(COUNT_NAMES), "V": len(game.ballots)}
+    sizes = {"B": worlds, "N": game.agents, "C": len(COUNT_NAMES), "V": len(game.in_force)}
     classes = Law.__annotations__
     arrays = {name: filled(classes[name], values, **sizes) for name, values in game.law_parameters.items()}
     ledger = filled(Ledger, {}, **sizes)

@@ -31,7 +31,8 @@ class Ledger(NamedTuple):
     """The arrays that all institutions share. All but `in_force` are cleared when an episode begins."""
 
     in_force: Annotated[Float64, "B V", InState(cleared=False)]
-    """The result of each ballot: a tax rate, the share of a quota, or the index of an agent."""
+    """The result of each ballot, and last what a governor sets, see `cprl.Game.in_force`: a tax rate, the
+    share of a quota, or the index of an agent."""
     violation_step: Annotated[Int32, "B N", STEPS]
     """The step of the agent's last violation; 0 for none in this episode."""
     detected: Annotated[Bool, "B N", IN_STATE]

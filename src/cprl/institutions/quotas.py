@@ -70,7 +70,7 @@ def parameters(game: Any) -> dict[str, Any]:
     quotas = with_ballots(game, Quota)
     agent_yield = game.sustainable_yield / game.agents if quotas else 0.0
     largest_shares = [
-        quota.share if ballot < 0 else game.ballots[ballot].choices[-1] for quota, ballot in quotas
+        quota.share if ballot < 0 else game.in_force[ballot].choices[-1] for quota, ballot in quotas
     ]
     for (quota, _), share in zip(quotas, largest_shares, strict=True):
         _warn_of_less_than_an_apple(quota, agent_yield * share)

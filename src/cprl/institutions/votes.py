@@ -79,14 +79,15 @@ class Arrays(NamedTuple):
     choices: Annotated[Float64, "V choices"]
     is_election: Annotated[Bool, "V"]
     episodes: Annotated[Int32, "V"]
-    """The number of episodes from one time that the ballot is held to the next."""
+    """The number of episodes from one time that the ballot is held to the next; 0 for the number that a
+    governor sets, on which no agent votes."""
     override: Annotated[Int64, "V"]
     """The result is overridden if a uniform 32-bit word is below this threshold."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
     """Return the parameters in `Arrays` by name."""
-    ballots = game.ballots
+    ballots = game.in_force
     most_choices = max((len(ballot.choices) for ballot in ballots), default=1)
     choices = np.zeros((len(ballots), most_choices))
     for index, ballot in enumerate(ballots):
@@ -102,7 +103,13 @@ def parameters(game: Any) -> dict[str, Any]:
 
 def is_due(ballots: Arrays, ballot: int, episode: int) -> bool:
     """Return whether a ballot is held in an episode, counted from 0."""
-    return episode % ballots.episodes[ballot] == 0
+    return ballots.episodes[ballot] > 0 and episode % ballots.episodes[ballot] == 0
+
+
+def has_governor(ballots: Arrays) -> bool:
+    """Return whether a governor sets the last number in force."""
+    last = ballots.episodes.shape[0] - 1
+    return last >= 0 and ballots.episodes[last] == 0
 
 
 def choice_of(ballots: Arrays, ballot: int, decision: int) -> int:

@@ -2,6 +2,7 @@
 
 Modules, in the order in which one reads them:
     social        the formulas of the metrics
+    welfare       what a governor wants of a period or an episode
     registry      every total and every metric, each said once: words, unit, formula, bounds, colour
     tracker       Episode, and EpisodeTracker, which makes them of batches of turns; metrics of the user's own
     playing       one fresh episode in every world, without learning, turn by turn

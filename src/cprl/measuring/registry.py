@@ -24,7 +24,7 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons.cells import APPLE, Colour
-from cprl.institutions import COUNT_NAMES, Institution, Levies, ledger
+from cprl.institutions import COUNT_NAMES, Governor, Institution, Levies, ledger
 from cprl.measuring.social import (
     AgentGroups,
     equality,
@@ -165,6 +165,15 @@ TOTALS: Final[Mapping[str, Total]] = _by_name(
         axes="V",
         dtype=np.float64,
         add=_keep_first,
+        is_of_institutions=True,
+        column=None,
+    ),
+    Total(
+        name="rules",
+        entry="in_force",
+        axes="V",
+        dtype=np.float64,
+        add=_add_entry,
         is_of_institutions=True,
         column=None,
     ),
@@ -451,6 +460,23 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
         colour=ORANGE,
         **_INCOMES_PLOT,
     ),
+    # In games with a governor: the mean of the number that it sets, and what it wants, of the whole episode.
+    Metric(
+        name="governor/rule",
+        words="mean of what the governor sets",
+        unit="rate or share",
+        formula=lambda rules, steps, wanted: share_of(rules[..., -1], steps),
+        colour=PURPLE,
+    ),
+    Metric(
+        name="governor/objective",
+        words="objective of the governor",
+        unit="a turn",
+        formula=lambda harvest, fines, transfers, steps, stock_left, wanted: wanted(
+            incomes_of(harvest, fines, transfers), steps, stock_left
+        ),
+        colour=GREEN,
+    ),
 )
 """All metrics, in the order of pages and tables."""
 IN_FORCE_PREFIX: Final = f"{INSTITUTIONS}in_force_"
@@ -464,7 +490,7 @@ def compute_metrics(totals: Mapping[str, Any], names: Iterable[str] = METRICS) -
 
     Args:
         totals: arrays [..., N] or [...] by the names of `TOTALS`; also the constants "sustainable_yield",
-            "first_stock" and "groups" of a game that has them.
+            "first_stock", "groups" and "wanted" (`cprl.measuring.welfare.wanted_in`) of a game that has them.
         names: the names of the metrics to compute.
     """
     known = {name: value for name, value in totals.items() if value is not None}
@@ -489,6 +515,8 @@ def metrics_for(reported: Collection[str], institutions: Sequence[Institution] =
     known = {*counts_for(institutions), *TOTALS.keys() - {*COUNT_NAMES}, VIOLATIONS}
     if nested_groups(institutions) is not None:
         known.add("groups")
+    if any(isinstance(institution, Governor) for institution in institutions):
+        known.add("wanted")
     return tuple(
         name
         for name, metric in METRICS.items()

@@ -42,6 +42,28 @@ def equality(incomes: Any) -> Float64:
     return np.where((incomes < 0).any(-1), np.nan, value)
 
 
+def lorenz_curve(harvest: Float64) -> Float64:
+    """Return the share of the harvest that the k agents with the least have together, for k = 0 to N.
+
+    Twice the area between the curve and the diagonal is the Gini coefficient, which is 1 - equality.
+
+    Args:
+        harvest: float [N], the apples of each agent.
+
+    Returns:
+        float [N + 1], from 0 to 1; NaN if there is no harvest.
+    """
+    total = harvest.sum()
+    if total <= 0:
+        return np.full(len(harvest) + 1, np.nan)
+    return np.concatenate([[0.0], np.sort(harvest).cumsum() / total])
+
+
+def gini(curve: Float64) -> float:
+    """Return the Gini coefficient of a Lorenz curve [N + 1], 0 for equal shares."""
+    return float(1 - (curve[1:] + curve[:-1]).sum() / (len(curve) - 1))
+
+
 def incomes_of(harvest: Any, fines: Any, transfers: Any) -> Float64:
     """Return harvest - fines + transfers of each agent, float64 [..., N]; below 0 where fines exceed all
     else.

@@ -32,6 +32,7 @@ from cprl.measuring.registry import (
     nested_groups,
     reported_in,
 )
+from cprl.measuring.welfare import wanted_in
 from cprl.values import Custom, Positive, checked, metric_words
 from cprl.values.array_types import AnyArray, Float64, Int64
 
@@ -278,6 +279,7 @@ class EpisodeTracker:
         institutions: those of the game, which determine their metrics, see
             `cprl.measuring.registry.metrics_for`.
         metrics: custom metrics; each names a function of an `Episode` that returns a number.
+        wanted: the objective of the game's governor, see `cprl.measuring.welfare.wanted_in`.
 
     Raises:
         ValueError: if a number is below 1; in `add`, if a batch has a wrong shape or lacks an entry.
@@ -292,6 +294,7 @@ class EpisodeTracker:
         first_stock: float | None = None,
         institutions: Sequence[Institution] = (),
         metrics: Sequence[Custom] = (),
+        wanted: Any = None,
     ) -> None:
         self.worlds = checked("worlds", worlds, Positive)
         self.agents = checked("agents", agents, Positive)
@@ -301,6 +304,7 @@ class EpisodeTracker:
             "sustainable_yield": sustainable_yield,
             "first_stock": first_stock,
             "groups": nested_groups(institutions),
+            "wanted": wanted,
         }
         self._count_names = counts_for(institutions)
         self._metrics = checked("metrics", metrics, tuple[Custom, ...])
@@ -515,11 +519,13 @@ class EpisodeTracker:
 def tracker_of(env: EnvBase, metrics: Sequence[Custom] = ()) -> EpisodeTracker:
     """Return an `EpisodeTracker` for all worlds of an environment, with its institutions, its sustainable
     yield, and custom metrics."""
+    commons = commons_of(env)
     return EpisodeTracker(
         env.batch_size.numel(),
         agent_count(env),
         institutions=institutions_of(env),
         metrics=metrics,
+        wanted=None if commons is None else wanted_in(commons.game),
         **yield_of(env),
     )
 
@@ -558,8 +564,8 @@ def metrics_of(env: EnvBase, reported: Collection[str]) -> tuple[str, ...]:
 def decisions_of(env: EnvBase) -> tuple[str, ...]:
     """Return the titles of the decisions in an episode, in the order of "in_force"."""
     commons = commons_of(env)
-    if commons is not None and commons.game.ballots:
-        return tuple(ballot.title for ballot in commons.game.ballots)
+    if commons is not None and commons.game.in_force:
+        return tuple(ballot.title for ballot in commons.game.in_force)
     (width,) = env.observation_spec[keys.IN_FORCE].shape[env.batch_dims :]
     return tuple(f"decision {number}" for number in range(width))
 

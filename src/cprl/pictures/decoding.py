@@ -4,11 +4,26 @@ from typing import Final
 
 import numpy as np
 
+from cprl.commons.cells import APPLE, BEAM, CLEANING, GROUND, MARK, OTHER, SELF, WALL, WASTE, WATER
 from cprl.commons.game import Game
 from cprl.values.array_types import UInt8
 
 UNSEEN: Final = 255
 """The class of an unknown cell: its colour is none of the game, or it lies outside all windows."""
+SIGNS: Final = {
+    GROUND: ".",
+    WALL: "#",
+    APPLE: "A",
+    BEAM: "*",
+    OTHER: "O",
+    SELF: "@",
+    WATER: "~",
+    WASTE: "H",
+    CLEANING: "*",
+    MARK: "+",
+    UNSEEN: "?",
+}
+"""The sign of each class of cells in a window as text; other agents that can be told apart are `O` too."""
 
 
 def classes_seen(game: Game, windows: UInt8) -> UInt8:
@@ -32,3 +47,10 @@ def classes_seen(game: Game, windows: UInt8) -> UInt8:
     for cell_class, (red, green, blue) in enumerate(game.palette.astype(np.uint32)):
         classes[colours == (red | green << 8 | blue << 16)] = cell_class
     return classes
+
+
+def window_text(game: Game, window: UInt8) -> str:
+    """Return what an agent observed, uint8 [C, X, Y], as lines of `SIGNS`."""
+    classes = classes_seen(game, window[None, None])[0, 0]
+    signs = np.vectorize(lambda kind: SIGNS.get(kind, "O"))(classes)
+    return "\n".join(map("".join, signs))

@@ -4,6 +4,7 @@ The digits of the numbers are paths on a grid of three by five points. So an ima
 the viewer can draw them as lines, both without a font.
 """
 
+from collections.abc import Sequence
 from functools import cache
 from itertools import pairwise
 from typing import Annotated, Any, Final, TypeAlias
@@ -15,7 +16,7 @@ from cprl.commons.cells import APPLE, BEAM, CLEANING, GROUND, WALL, WASTE, WATER
 from cprl.commons.maps import Cell, Map
 from cprl.commons.world import WorldView
 from cprl.institutions import Boundaries
-from cprl.pictures.colours import PALETTE, agent_colour, agent_mark
+from cprl.pictures.colours import GREY, PALETTE, agent_colour, agent_mark
 from cprl.values import Range, checked
 from cprl.values.array_types import Bool, Float32, UInt8
 
@@ -191,6 +192,11 @@ def _draw_number(body: UInt8, agent: int, heading: int, *, front: int, back: int
 
 OwnedRegions: TypeAlias = list[tuple[list[int], Bool]]
 """The owners of each region, and its cells, bool [H, W]."""
+
+
+def region_colour(owners: Sequence[int]) -> Colour:
+    """Return the colour of a region: that of its owner, or grey for several owners."""
+    return agent_colour(owners[0]) if len(owners) == 1 else GREY
 
 
 def regions_of(game: Any) -> OwnedRegions:

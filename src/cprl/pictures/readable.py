@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from dataclasses import fields
 from html import escape
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -16,6 +17,7 @@ from cprl.institutions import (
     Boundaries,
     ClosedPatches,
     ClosedSeason,
+    Governor,
     GraduatedSanctions,
     Institution,
     Levies,
@@ -184,6 +186,9 @@ def meaning_of(institution: Institution, game: Game) -> str:
             return text + _breach(institution.fine, game)
         case Vote():
             return _vote(institution, game)
+        case Governor(every_steps=every):
+            options = ", ".join(map(_number, institution.options))
+            return f"Every {_turns(every)} a governor sets {institution.decided.title}: one of {options}."
         case Tax():
             return _tax(institution)
         case Levies(groups=groups, local_rate=local, joint_rate=joint):
@@ -372,3 +377,23 @@ def _sign_sentences(game: Game) -> list[str]:
     if any(institution.can_be_broken for institution in game.institutions):
         signs.append("A white diamond marks an agent that breaks a rule.")
     return signs
+
+
+def instructions_of(game: Game, view: str) -> list[str]:
+    """Return the rules of a game in sentences, for those who play it."""
+    tag = tag_of(game)
+    seen = "the whole board" if view == "board" else "the cells around you, your heading up"
+    sentences = [growth_of(game), f"You see {seen}.", *([f"{capitalised(tag)}."] if tag else [])]
+    sentences += [meaning_of(institution, game) for institution in game.institutions]
+    steps = game.rules.episode_steps
+    return [*sentences, f"A round has {steps:,} turns at most; it ends earlier if no apple is left."]
+
+
+def options_of(game: Game) -> list[str] | None:
+    """Return the decisions of a game in words, in the order of their numbers; None without ballots."""
+    words = []
+    for ballot in game.ballots:
+        elected = "agent " * ballot.is_election
+        words.append([f"{ballot.title}: {elected}{choice:g}" for choice in ballot.choices])
+    # The first ballot changes fastest.
+    return ["; ".join(reversed(choices)) for choices in product(*reversed(words))] if words else None

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 from cprl import keys, recurrent_state
 from cprl.policies.actors import LaneActor
 from cprl.policies.decisions import Decider
+from cprl.policies.governors import GovernorActor
 from cprl.system.compat.tensordicts import unchecked_tensordict
 
 ActorAgents: TypeAlias = int | tuple[int, ...]
@@ -31,7 +32,7 @@ class _Assignment:
     agents: int | list[int]
     """The agents, as the axis of agents is indexed: an index removes the axis, a list keeps it."""
     in_keys: tuple[str, ...]
-    """The entries of "agents" that the actor reads, in the order of its arguments."""
+    """The entries of "agents", and "done", that the actor reads, in the order of its arguments."""
     state_cells: int
     """The numbers in an agent's recurrent state; 0 for an actor without one."""
     worlds: int
@@ -57,11 +58,14 @@ class JointPolicy(TensorDictModuleBase):
             each controls: an index for an actor of one agent, a tuple for an actor of several, e.g. a
             `LaneActor`.
         decisions: chooses on the ballots of games that have any (`Game.decisions`); None in other games.
+        governor: decides in games with a `Governor`; None in other games, and where its first option stays in
+            force.
 
     Reads ("agents", "observation"), uint8 [B, N, C, X, Y], and the other entries of "agents" that an actor's
     `in_keys` name, e.g. "apple_ahead"; writes ("agents", "action"), int64 [B, N].
     With recurrent actors it also reads "recurrent_state", and writes that and "recurrent_state_before".
-    With decisions it also reads "ballots_due", and writes ("agents", "decision"), int64 [B, N].
+    With decisions it also reads "ballots_due", and writes ("agents", "decision"), int64 [B, N]; with a
+    governor "seen" and "rule".
     """
 
     in_keys: tuple[Any, ...] = (keys.OBSERVATION,)
@@ -72,6 +76,7 @@ class JointPolicy(TensorDictModuleBase):
         actors: Sequence[nn.Module] | Mapping[ActorAgents, nn.Module],
         *,
         decisions: Decider | None = None,
+        governor: GovernorActor | None = None,
     ) -> None:
         super().__init__()
         actors_by_agents = dict(actors.items() if isinstance(actors, Mapping) else enumerate(actors))
@@ -85,6 +90,7 @@ class JointPolicy(TensorDictModuleBase):
         """The agents of each actor, in the order of `actors`."""
         self.actors = nn.ModuleList(actors_by_agents.values())
         self.decisions = decisions
+        self.governor = governor
         self._assignments = [
             _Assignment.from_actor(actor, agents) for agents, actor in actors_by_agents.items()
         ]
@@ -101,6 +107,9 @@ class JointPolicy(TensorDictModuleBase):
                 )
             self.in_keys = (keys.OBSERVATION, keys.BALLOTS_DUE)
             self.out_keys = (keys.ACTION, keys.DECISION)
+        if governor is not None:
+            self.in_keys = (*self.in_keys, keys.SEEN)
+            self.out_keys = (*self.out_keys, keys.RULE)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         agents = keys.entry(tensordict, keys.AGENTS)
@@ -109,6 +118,8 @@ class JointPolicy(TensorDictModuleBase):
         if self.decisions is not None:
             ballots_due = keys.entry(tensordict, keys.BALLOTS_DUE)
             keys.put(agents, "decision", self.decisions.decide(ballots_due))
+        if self.governor is not None:
+            keys.put(tensordict, keys.RULE, self.governor.decide(keys.entry(tensordict, keys.SEEN)))
         observation = keys.entry(agents, "observation")
         self._refuse_other_agents(observation.shape[batch_dims])
         shape = observation.shape[: batch_dims + 1]
@@ -116,12 +127,12 @@ class JointPolicy(TensorDictModuleBase):
             recurrent_state.prepare(agents, (*shape, self.state_cells), observation.device)
         if self._one_actor_plays_all:  # reads and writes whole entries, without indexing or copying them
             (assignment,) = self._assignments
-            keys.put(agents, "action", _choose(assignment, agents, (), tensordict.batch_size))
+            keys.put(agents, "action", _choose(assignment, agents, (), tensordict))
             return tensordict
         actions = observation.new_empty(shape, dtype=torch.int64)
         for assignment in self._assignments:
             index = (*[slice(None)] * batch_dims, assignment.agents)
-            actions[index] = _choose(assignment, agents, index, tensordict.batch_size)
+            actions[index] = _choose(assignment, agents, index, tensordict)
         agents.set("action", actions)
         return tensordict
 
@@ -142,21 +153,27 @@ class JointPolicy(TensorDictModuleBase):
 
 
 def _choose(
-    assignment: _Assignment, agents: TensorDictBase, index: tuple[Any, ...], batch_size: torch.Size
+    assignment: _Assignment, agents: TensorDictBase, index: tuple[Any, ...], worlds: TensorDictBase
 ) -> Tensor:
     """Return the actions that an actor chooses for its agents; write their recurrent states, if it has any.
 
     Args:
         agents: the entries of "agents", [B, N, ...].
         index: selects the actor's agents in these entries; () selects all.
+        worlds: the entries of worlds, [B], of which an actor may read "done".
     """
     actor = assignment.actor
     names = assignment.in_keys
-    inputs = [_read_entry(agents, name, index, assignment.state_cells) for name in names]
+    inputs = [
+        keys.entry(worlds, name)
+        if name == keys.DONE
+        else _read_entry(agents, name, index, assignment.state_cells)
+        for name in names
+    ]
     if isinstance(actor, LaneActor):  # the same as its forward, without the cost of a TensorDict
         action, *states_after = actor.choose_with(*inputs)
     else:
-        output = actor(unchecked_tensordict(dict(zip(names, inputs, strict=True)), batch_size))
+        output = actor(unchecked_tensordict(dict(zip(names, inputs, strict=True)), worlds.batch_size))
         action = output.get("action")
         states_after = [output.get(recurrent_state.AFTER)] if assignment.state_cells else []
     for states in states_after:

@@ -1,16 +1,8 @@
 """ScriptedActor: agents that follow a fixed rule, a scripted policy, and do not learn.
 
-They see what a learning agent sees: their observation window. Under `Quirks2019.paint_over`, where an agent's
-own heading mark covers the cell ahead of it, they also see whether this cell holds an apple.
-
-| policy | behaviour |
-|---|---|
-| "random" | chooses every action with equal probability, including the beam |
-| "greedy" | takes the shortest path to the nearest apple in sight; wanders if it sees none |
-| "sustainable" | as "greedy", but steps on an apple only if it sees at least `spare` others near it |
-| "territorial" | fires if its beam covers an agent that is near an apple in sight; else as "greedy" |
-| "aggressive" | fires if its beam covers an agent; else follows the nearest in sight; else as "greedy" |
-| "pacifist" | as "greedy", but leaves apples that another agent in sight reaches in fewer steps |
+`BEHAVIOURS` says what each policy does. They see what a learning agent sees: their observation window. Under
+`Quirks2019.paint_over`, where an agent's own heading mark covers the cell ahead of it, they also see whether
+this cell holds an apple.
 
 - "Near" means within `Rules.regrow_radius_cells`, measured by `Rules.regrow_norm`. "In sight" means in the
   window and reachable in it, around walls and other agents.
@@ -61,13 +53,22 @@ from cprl.policies.scripted_rules import (
     SearchBuffers,
     Settings,
 )
-from cprl.values.array_types import UInt8
+from cprl.values.array_types import Float64, Int64, UInt8
 
 ScriptedPolicy = Literal["random", "greedy", "sustainable", "territorial", "aggressive", "pacifist"]
 SCRIPTED_POLICIES: Final[tuple[ScriptedPolicy, ...]] = get_args(ScriptedPolicy)
 """The names of all scripted policies, in the order of the constants RANDOM, GREEDY, ... of
 `cprl.policies.scripted_rules`."""
 
+BEHAVIOURS: Final[Mapping[ScriptedPolicy, str]] = {
+    "random": "chooses every action with equal probability, including the beam",
+    "greedy": "takes the shortest path to the nearest apple in sight; wanders if it sees none",
+    "sustainable": "as greedy, but steps on an apple only if it sees at least `spare` others near it",
+    "territorial": "fires if its beam covers an agent that is near an apple in sight; else as greedy",
+    "aggressive": "fires if its beam covers an agent; else follows the nearest in sight; else as greedy",
+    "pacifist": "as greedy, but leaves apples that another agent in sight reaches in fewer steps",
+}
+"""What agents of each policy do."""
 _NEAR: Final = ("regrow_radius_cells", "regrow_norm")
 _BEAM: Final = (
     "beam_length_cells",
@@ -152,18 +153,39 @@ class ScriptedActor(ActorOfLanes):
         """
         explores = exploration_type() in (ExplorationType.RANDOM, None)
         epsilon = float(self.epsilon) if explores else 0.0
-        chosen = np.empty(observation.shape[:2], np.int64)
+        roles = self._framed(observation, apple_ahead)
+        policy = SCRIPTED_POLICIES.index(self.policy)
+        chosen = self._choose(policy, epsilon, roles, self._numbers(), self._settings)
+        return torch.from_numpy(chosen.reshape(observation.shape[:2])).to(observation.device)
+
+    def choose_each(
+        self, policies: Int64, spare: Int64, observation: Tensor, apple_ahead: Tensor | None = None
+    ) -> Int64:
+        """Choose actions by a policy of each agent instead of `policy`, int64 [replicas x k, S].
+
+        Args:
+            policies: indices into `SCRIPTED_POLICIES`, [replicas x k, S].
+            spare: see the constructor, [replicas x k, S].
+        """
+        roles = self._framed(observation, apple_ahead)
+        numbers = self._numbers()
+        kinds, kind = np.unique(np.stack([policies.ravel(), spare.ravel()], 1), axis=0, return_inverse=True)
+        chosen = np.empty(policies.size, np.int64)
+        for index, (policy, left) in enumerate(kinds.tolist()):
+            lanes = np.flatnonzero(kind.ravel() == index)
+            settings = self._settings._replace(spare=left)
+            chosen[lanes] = self._choose(policy, 0.0, roles[lanes], numbers[lanes], settings)
+        return chosen.reshape(policies.shape)
+
+    def _choose(
+        self, policy: int, epsilon: float, roles: UInt8, numbers: Float64, settings: Settings
+    ) -> Int64:
+        """Choose the actions of n agents, int64 [n], see `scripted_rules.choose_all`."""
+        chosen = np.empty(len(roles), np.int64)
         compiled_for_cpu(scripted_rules.choose_all, inline=False)(
-            SCRIPTED_POLICIES.index(self.policy),
-            epsilon,
-            self._framed(observation, apple_ahead),
-            self._frame,
-            self._numbers(),
-            self._settings,
-            self._scratch,
-            chosen.reshape(-1),
+            policy, epsilon, roles, self._frame, numbers, settings, self._scratch, chosen
         )
-        return torch.from_numpy(chosen).to(observation.device)
+        return chosen
 
     def _framed(self, observation: Tensor, apple_ahead: Tensor | None) -> UInt8:
         """Return the roles of the cells in each agent's window, with a frame of wall around them: uint8

@@ -12,6 +12,7 @@ from typing import Any, Final
 import pyarrow as pa
 
 from cprl.measuring.table import ROW_ORDER
+from cprl.policies.asking import CALLS
 from cprl.runs.checkpoints import CHECKPOINTS
 from cprl.runs.episodes import FILE_NAME, read_episodes, read_table, write_small
 from cprl.runs.files import (
@@ -31,7 +32,7 @@ from cprl.values import describe_changes
 
 _REQUIRED_FILES: Final = (RECIPE_FILE, REPORT)
 _WEIGHTS: Final = f"{CHECKPOINTS}/final.pt"
-_AGENT_FILES: Final = (_WEIGHTS, f"{CHECKPOINTS}/{TRANSFORMS}", f"{CHECKPOINTS}/{DECISIONS}", TURNS)
+_AGENT_FILES: Final = (_WEIGHTS, f"{CHECKPOINTS}/{TRANSFORMS}", f"{CHECKPOINTS}/{DECISIONS}", TURNS, CALLS)
 _RUN_FILES: Final = (LOCK_FILE, "run.rrd", "episodes.arrows", "logs", f"{CHECKPOINTS}/*-*.pt")
 """Files of a run that an export does not have."""
 

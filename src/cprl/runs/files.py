@@ -198,6 +198,11 @@ MANIFEST_FILE: Final = "manifest.json"
 _NAMED_CHECKSUM: Final = re.compile(r"-([0-9a-f]{32})\.pt")
 
 
+def time_now() -> str:
+    """Return the time as files of runs hold it, to the second, with the zone."""
+    return datetime.now().astimezone().isoformat(timespec="seconds")
+
+
 def checksum(path: Path) -> str:
     """Return the BLAKE2b checksum of a file, 16 bytes in hexadecimal."""
     with open(path, "rb") as file:
@@ -411,8 +416,7 @@ class RunLock:
             fcntl.flock(file, fcntl.LOCK_SH)  # an exclusive lock by others lasts only this moment
 
     def _write_holder(self, file: int) -> None:
-        started = datetime.now().astimezone().isoformat(timespec="seconds")
-        holder = {"host": socket.gethostname(), "pid": os.getpid(), "started": started}
+        holder = {"host": socket.gethostname(), "pid": os.getpid(), "started": time_now()}
         holder |= {} if self._study is None else {"study": self._study}
         if os.fstat(file).st_nlink > 1 and self._is_in_place(file):
             self.path.unlink()  # do not write through a hard link; the next attempt makes a new file

@@ -34,7 +34,8 @@ class Length:
         return cls(number, unit, clock)
 
     def __str__(self) -> str:
-        return f"{self.number:,} {self.unit}"
+        unit = self.unit.removesuffix("s") if self.number == 1 else self.unit
+        return f"{self.number:,} {unit}"
 
     @property
     def flag(self) -> str:

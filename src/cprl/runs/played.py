@@ -1,7 +1,6 @@
 """Runs of people: episodes that were played and not trained, as a finished run."""
 
 from collections.abc import Sequence
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -11,7 +10,7 @@ import pyarrow as pa
 from cprl.measuring.table import where
 from cprl.measuring.tracker import Episode
 from cprl.runs.episodes import FILE_NAME, read_table, table_of, write_small
-from cprl.runs.files import REPORT, refuse_to_write_over, write_json, write_listed
+from cprl.runs.files import REPORT, refuse_to_write_over, time_now, write_json, write_listed
 from cprl.runs.recipe import read_recipe
 from cprl.runs.weights import save_weights
 
@@ -50,8 +49,7 @@ def write_played(run: Path, episodes: Sequence[Episode], **tables: pa.Table) -> 
     for name, table in {**played, **tables}.items():
         write_listed(run, f"{name}.parquet", partial(write_small, table))
     save_weights(run, {})
-    finished = datetime.now().astimezone().isoformat(timespec="seconds")
-    write_json(run / REPORT, {"finished": finished, "episodes": experiment["episodes"]})
+    write_json(run / REPORT, {"finished": time_now(), "episodes": experiment["episodes"]})
 
 
 def absence(run: Path) -> str:

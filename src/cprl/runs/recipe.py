@@ -212,13 +212,15 @@ def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") ->
     return dict(recipe["experiment"])
 
 
-STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)(\.start_from|\.runs\.\d+)?\.run")
-"""The path of a study's factor that is the run of a `Frozen` agent."""
+STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)\.((start_from\.|runs\.\d+\.)?run|stored)")
+"""The path of a study's factor that is a run."""
+_RUN_FIELDS: Final = {"Frozen": {"run"}, "Language": {"stored"}}
+"""The fields that hold the path of a run, by kind."""
 
 
 def with_runs_moved(table: Any, start: str | Path, end: str | Path, *, is_run: bool = False) -> Any:
-    """Return a table, of an experiment or of values by path, in which the runs of `Frozen` agents are
-    relative to `end` instead of `start`. An argument "run" of user code stays."""
+    """Return a table, of an experiment or of values by path, in which the runs of its agents are relative to
+    `end` instead of `start`. An argument "run" of user code stays."""
     if isinstance(table, str) and is_run and not os.path.isabs(table):
         return os.path.relpath(os.path.join(start, table), end)
     if isinstance(table, list):
@@ -226,7 +228,7 @@ def with_runs_moved(table: Any, start: str | Path, end: str | Path, *, is_run: b
     if not isinstance(table, Mapping) or table.get("kind") == "Custom":
         return table
     names = {name for name in table if is_run or STORED_RUN.fullmatch(name)}
-    names |= {"run"} if table.get("kind") == "Frozen" else set()
+    names |= _RUN_FIELDS.get(str(table.get("kind")), set())
     return {name: with_runs_moved(entry, start, end, is_run=name in names) for name, entry in table.items()}
 
 
@@ -438,3 +440,45 @@ def _run_git(folder: Path, *arguments: str) -> str | None:
 def custom_rules_in(table: Mapping[str, Any]) -> str:
     """Return a description of the custom rules in a stored experiment; "" without any."""
     return "; ".join(describe_customs([table.get("game"), table.get("transforms")]))
+
+
+_LONGEST_VALUE: Final = 90
+"""The longest text of a value in the recipe's table, in characters; recipe.json has the whole text."""
+
+
+def recipe_table(recipe: Mapping[Any, Any]) -> str:
+    """Return a recipe as a Markdown table with one row per value, such as `| rules.beam_length_cells | 10 |`.
+
+    Texts of several lines, such as drawn boards, follow below the table. An entry of a list that equals the
+    first entry is one row that refers to the first.
+    """
+    rows = []
+    long_texts = []
+    for path, value in _values_by_path(recipe, ""):
+        if isinstance(value, str) and "\n" in value:
+            long_texts.append(f"`{path}`\n\n```\n{value}\n```")
+            continue
+        text = value if isinstance(value, str) else short_repr(value)
+        if len(text) > _LONGEST_VALUE:
+            text = f"{text[:_LONGEST_VALUE]} ..."
+        rows.append(f"| {_table_cell(path)} | {_table_cell(text)} |")
+    return "\n\n".join(["\n".join(["| place | value |", "| --- | --- |", *rows]), *long_texts])
+
+
+def _values_by_path(value: Any, path: str) -> Iterator[tuple[str, Any]]:
+    """Yield each value that holds no other values, with its dotted path: {"a": {"b": 1}} yields "a.b", 1."""
+    if isinstance(value, Mapping) and value:
+        for name, entry in value.items():
+            yield from _values_by_path(entry, f"{path}.{name}".removeprefix("."))
+    elif isinstance(value, list | tuple) and any(isinstance(entry, Mapping) for entry in value):
+        for index, entry in enumerate(value):
+            if index and entry == value[0]:
+                yield f"{path}.{index}", f"as {path}.0"
+            else:
+                yield from _values_by_path(entry, f"{path}.{index}")
+    else:
+        yield path, value
+
+
+def _table_cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")

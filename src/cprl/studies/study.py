@@ -12,6 +12,7 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeAlias
 
+from cprl.algorithms.base import TrainingEngine
 from cprl.experiment.engine import engine_of
 from cprl.experiment.experiment import MOST_SEED, Experiment
 from cprl.population import refuse_people
@@ -73,6 +74,11 @@ class Condition:
     name: str = ""
 
     @cached_property
+    def engine(self) -> TrainingEngine:
+        """Return the engine that trains its replicas."""
+        return engine_of(self.experiment)
+
+    @cached_property
     def checksum(self) -> str:
         """Return 12 hexadecimal digits that identify everything that decides the numbers, except the seed.
 
@@ -88,7 +94,7 @@ class Condition:
         directory, so that it does not depend on the working directory.
         """
         config = with_runs_moved(self.experiment.to_config(), ".", runs)
-        config["engine"] = engine_of(self.experiment)
+        config["engine"] = self.engine
         table = {name: value for name, value in config.items() if name not in NOT_IN_CHECKSUM}
         differing = without_defaults(table, Experiment)
         if differing["engine"] == "compiled":  # the default when the format began

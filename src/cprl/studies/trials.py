@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple
 
 from cprl.experiment import Experiment
-from cprl.experiment.engine import engine_of
 from cprl.population import Frozen, partners_in, with_stored
 from cprl.runs.checkpoints import endings_of
 from cprl.runs.files import (
@@ -87,7 +86,8 @@ class Trial:
             seed=self.block.seed,
             replicas=self.block.replicas,
             agents=agents,
-            engine=engine_of(experiment),
+            governor=with_stored(experiment.governor, in_block),
+            engine=self.condition.engine,
         )
 
     @cached_property
@@ -349,7 +349,7 @@ class Task:
         if state_of(run) != "missing":
             return None
         try:
-            start(run, experiment, partners_in(experiment.agents))
+            start(run, experiment, partners_in(experiment.specs))
         except FileExistsError:
             if state_of(run) == "missing" and not (run / LOCK_FILE).exists():
                 raise

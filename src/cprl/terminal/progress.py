@@ -1,7 +1,7 @@
 """ProgressBar: shows in the terminal, or in a notebook, how far a training is."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from threading import Event, Thread
 from typing import Any, Final, Self
 
@@ -55,6 +55,7 @@ class ProgressBar:
         title: the words before the bar.
         replicas: the number of replicas.
         console: where to print; by default the terminal.
+        more: returns more words for the end of the line, "" for none.
     """
 
     def __init__(
@@ -65,8 +66,10 @@ class ProgressBar:
         title: str = "training",
         replicas: int = 1,
         console: Console | None = None,
+        more: Callable[[], str] | None = None,
     ) -> None:
         self.console = console or safe_console()
+        self._more = more or str
         self._title = title
         self._length = schedule.length
         self._rules_episode_steps = clock_in(getattr(game, "game", game))
@@ -105,9 +108,9 @@ class ProgressBar:
         self._compiling_thread = Thread(target=self._print_compiling, daemon=True)
 
     @classmethod
-    def of(cls, experiment: Any) -> Self:
+    def of(cls, experiment: Any, more: Callable[[], str] | None = None) -> Self:
         """Return the bar of an `Experiment`."""
-        return cls(experiment.schedule, experiment.game, replicas=experiment.replicas)
+        return cls(experiment.schedule, experiment.game, replicas=experiment.replicas, more=more)
 
     def on_start(self, training: Any) -> None:
         """Begin at the steps and episodes that a resumed training has already played."""
@@ -146,7 +149,8 @@ class ProgressBar:
         position = f"episode {self._episodes // self._replicas}/{self._length.number}  "
         if self._length.is_of_steps:
             position = f"step {done:,.0f}/{self._length.number:,}  "
-        self._print(numbers + self._time_left(done), position)
+        more = self._more()
+        self._print(f"{numbers}{self._time_left(done)}{f'  {more}' if more else ''}", position)
 
     def _print(self, text: str, position: str = "") -> None:
         """Print a text beside the bar, or in a line of a notebook or file.

@@ -3,6 +3,7 @@
 Modules, in the order in which one reads them:
     learning    losses and shaped returns of the running episodes; whom a training accepts
     nan_check   what is NaN or infinite in a training, found and named
+    governing   a governor in a training: what it decides by, its periods, how it learns
     training    Training: one step after the other, with a state that can be read and set; train; callbacks
     stored      load: agents that an earlier run learned, and how they play
     agents      Population: the agents of an experiment, of whatever kind

@@ -1,6 +1,7 @@
 """Population: the agents of an experiment that learn, follow a script, or were trained by an earlier run."""
 
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any, get_args
 
@@ -21,13 +22,18 @@ from cprl.networks.agent import acting_network
 from cprl.networks.recurrent import state_shape_of
 from cprl.objectives.rewards import reward_name
 from cprl.policies.actors import random_agents
+from cprl.policies.asking import Calls
 from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
+from cprl.policies.governors import governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
+from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_names, lane_seeds
 from cprl.policies.scripted import RULES_READ, ScriptedActor
 from cprl.population import (
     AgentSpec,
     Frozen,
+    GovernorSpec,
+    Language,
     Learning,
     Pool,
     Scripted,
@@ -38,11 +44,13 @@ from cprl.population import (
     refuse_undecided,
     specs_by_agent,
 )
+from cprl.training.governing import Governing
 from cprl.training.stored import (
     LoadedRun,
     PoolActor,
     StoredAgent,
     decision_values,
+    language_agent,
     load,
     stored_actors,
     trained_agent,
@@ -73,6 +81,8 @@ class Population:
             weights is loaded next.
         weights: the names of the weights of `Frozen` agents by run, see `cprl.load`; runs not in it have
             their final ones.
+        governor: the specification of the governor; None leaves its first option in force.
+        governor_from_turn: the turns of the training before it decides.
     """
 
     def __init__(
@@ -86,6 +96,8 @@ class Population:
         engine: str = "compiled",
         starts: bool = True,
         weights: Mapping[str, str] | None = None,
+        governor: GovernorSpec | None = None,
+        governor_from_turn: int = 0,
     ) -> None:
         known = get_args(TrainingEngine)
         if engine not in known:
@@ -106,6 +118,8 @@ class Population:
         self._specs_by_agent = specs_by_agent(specs, self.spaces.agents)
         check_scripted(groups, self.spaces, self._game)
         self._replica_numbers = range(first_replica, first_replica + self.replicas)
+        self.calls = Calls()
+        """The calls of the agents' language models."""
         self.learners: dict[tuple[int, ...], AnyLearner] = {}
         for spec, agents in groups:
             if isinstance(spec, Learning | Team):
@@ -118,6 +132,8 @@ class Population:
         self.decisions: BanditDecider | None = self._make_decider()
         """The decisions of the agents on the game's ballots, and how they learn them; None without
         ballots."""
+        self.governor = self._make_governor(governor, governor_from_turn, weights or {})
+        """The governor, and how it learns; None without one."""
 
     @property
     def playing(self) -> Game | Spaces:
@@ -136,7 +152,8 @@ class Population:
             decisions = self.decisions.without_exploration(
                 Purpose.EVALUATED_DECISIONS, replicas=self.replicas, worlds=worlds
             )
-        return JointPolicy(actors, decisions=decisions)
+        governor = None if self.governor is None else self.governor.evaluation_actor(worlds)
+        return JointPolicy(actors, decisions=decisions, governor=governor)
 
     def random_policy(self, worlds: int) -> JointPolicy:
         """Return policies that take every action, and every choice of a decision, with equal probability."""
@@ -152,7 +169,8 @@ class Population:
             seed=self.seed,
             purpose=Purpose.RANDOM_PLAY,
         )
-        return JointPolicy(actors, decisions=decisions)
+        governor = None if self.governor is None else self.governor.random_actor(worlds)
+        return JointPolicy(actors, decisions=decisions, governor=governor)
 
     def networks(self) -> dict[str, nn.Module]:
         """Return copies of the learners' current acting networks, by "replica_0/agent_0" and so on, and the
@@ -162,7 +180,26 @@ class Population:
             networks |= learner.networks()
         for pool in self._pools.values():
             networks |= pool.networks()
-        return networks
+        return networks if self.governor is None else networks | self.governor.networks()
+
+    def _make_governor(
+        self, spec: GovernorSpec | None, from_turn: int, weights: Mapping[str, str]
+    ) -> Governing | None:
+        """Return the governor, which counts as the agent after the last one; None without one."""
+        if spec is None:
+            return None
+        if self._game is None or self._game.governor is None:
+            raise ValueError(f"governor is {spec}; allowed in a game without a Governor: None")
+        lanes = Lanes(
+            governor_spaces(self._game),
+            agents=(self._game.agents,),
+            replicas=self.replicas,
+            worlds=self.worlds,
+            seed=self.seed,
+            first_replica=self._replica_numbers.start,
+            device=self.device,
+        )
+        return Governing(self._game, self._game.governor, spec, lanes, from_turn=from_turn, weights=weights)
 
     def as_stored(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
         """Return copies of the current agents of some replicas, by agent and replica."""
@@ -188,13 +225,16 @@ class Population:
                 runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
                 _refuse_other_game(runs[spec.run], self.spaces, self._game, is_to_decide=True)
             replicas = map(spec.replica_for, self._replica_numbers)
-            return [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
+            stored = [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
+            return [replace(one, calls=self.calls) for one in stored]
 
         seeds = partial(lane_seeds, self.seed, replicas=self._replica_numbers, purpose=Purpose.EXPLORATION)
         agents: dict[int, list[StoredAgent]] = {}
         for agent, spec in enumerate(self._specs_by_agent):
             if isinstance(spec, Scripted):
                 agents[agent] = [StoredAgent(scripted=spec.policy)] * self.replicas
+            elif isinstance(spec, Language):
+                agents[agent] = [language_agent(spec, self.calls)] * self.replicas
             elif isinstance(spec, Frozen):
                 agents[agent] = frozen(spec)
             elif isinstance(spec, Pool):
@@ -234,6 +274,8 @@ class Population:
         """
         numbers = self._replica_numbers[:replicas]
         agents = {agent: stored[: len(numbers)] for agent, stored in self._others_as_stored().items()}
+        if purpose is Purpose.EXHIBITION:  # viewers cost no calls
+            agents = {agent: list(map(_without_language, stored)) for agent, stored in agents.items()}
         kinds = {
             agent: (getattr(self._specs_by_agent[agent], "run", None), stored[0].kind)
             for agent, stored in agents.items()
@@ -305,6 +347,10 @@ class Population:
         return weights
 
 
+def _without_language(agent: StoredAgent) -> StoredAgent:
+    return replace(agent, language=None)
+
+
 def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game: Game | None) -> None:
     """Refuse transforms that change the windows which scripted policies read.
 
@@ -316,7 +362,7 @@ def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game
     if game is None or spaces == game.spaces:
         return
     for spec, agents in groups:
-        if isinstance(spec, Scripted) and spec.policy != "random":
+        if isinstance(spec, Language) or (isinstance(spec, Scripted) and spec.policy != "random"):
             raise ValueError(
                 f"agents {list(agents)} follow {spec}, which reads the window of the game; transforms make "
                 f"it {spaces.observation_dtype} {list(spaces.observation_shape)}: leave those transforms "
@@ -339,7 +385,10 @@ def refuse_other_worlds(earlier: EnvBase, env: EnvBase, name: str, others: Itera
     pairs |= _pairs(games[0], spaces_of(earlier), games[1], spaces_of(env))
     if games[0] is not None and games[1] is not None:
         pairs["ballots"] = _ballot_choices(games[0]), _ballot_choices(games[1])
+        pairs["a governor:"] = games[0].governor, games[1].governor
         for actor in others:
+            if isinstance(actor, LanguageActor):
+                pairs["for a language model the game"] = games[0], games[1]
             if isinstance(actor, ScriptedActor):
                 for rule in RULES_READ[actor.policy]:
                     values = getattr(games[0].rules, rule), getattr(games[1].rules, rule)

@@ -50,6 +50,8 @@ def make_agents(
         engine=engine_of(experiment),
         starts=starts,
         weights=weights,
+        governor=experiment.governor,
+        governor_from_turn=experiment.governor_from_step // experiment.worlds,
     )
     with torch.random.fork_rng(devices=[]):
         fresh_env(experiment)  # refuse what the evaluation cannot play now, not after hours
@@ -190,7 +192,15 @@ class Evaluations:
             load_transforms_state(env, transforms_state(self._env))
             agents = self._population.as_stored(group)
             playing = self._population.playing
-            policies = stored_policies(agents, playing, replicas=group, worlds=worlds, seed=seed)
+            governor = self._population.governor
+            policies = stored_policies(
+                agents,
+                playing,
+                replicas=group,
+                worlds=worlds,
+                seed=seed,
+                governor=() if governor is None else governor.as_stored(group),
+            )
             episodes = evaluate(env, policies, metrics=experiment.metrics)
             for index, replica in enumerate(group):
                 played[replica] = episodes[index * worlds : (index + 1) * worlds]
@@ -224,12 +234,12 @@ def is_repeatable(experiment: Experiment) -> bool:
     it would: in a `cprl.Game`, which depends on seeds alone, without transforms, which may learn, and without
     ballots, whose results agents see at the start of the next episode."""
     game = experiment.game
-    return isinstance(game, Game) and not game.ballots and not experiment.transforms
+    return isinstance(game, Game) and not game.in_force and not experiment.transforms
 
 
 def _keeps_decisions(env: EnvBase) -> bool:
     commons = commons_of(env)
-    return commons is not None and any(ballot.period_episodes > 1 for ballot in commons.game.ballots)
+    return commons is not None and any(ballot.period_episodes != 1 for ballot in commons.game.in_force)
 
 
 def evaluate_population(

@@ -4,7 +4,6 @@ import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
-from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,10 +20,11 @@ from cprl.experiment.engine import about_engine, begun_with, engine_of, planned_
 from cprl.learners.protocol import AnyLearner
 from cprl.measuring.table import labelled, store_agent_names, where
 from cprl.measuring.tracker import Episode, try_custom_metrics
+from cprl.policies.asking import CALLS
 from cprl.population import exploration_steps, partners_in
 from cprl.runs.checkpoints import CHECKPOINTS, Checkpointer, endings_of
 from cprl.runs.episodes import EpisodeTable
-from cprl.runs.files import LOCK_FILE, REPORT, RunLockedError, refuse_missing, write_json
+from cprl.runs.files import LOCK_FILE, REPORT, RunLockedError, refuse_missing, time_now, write_json
 from cprl.runs.length import Length
 from cprl.runs.loggers import LoggerCallback, check_logger, make_logger
 from cprl.runs.recipe import (
@@ -148,6 +148,7 @@ def run(
             if not _begin(opened):
                 checkpointer.done()
                 return directory
+            opened.population.calls.keep_in(directory / CALLS)
             viewer = viewer_stack.enter_context(_make_viewer(watch, opened))
             _Stages(opened, viewer).take_all(checkpointer, times, figures=figures)
             checkpointer.done()
@@ -195,7 +196,7 @@ def _open_run(
     experiment = _with_engine(requested, resumed)
     state, _, step = _find_next_step(out, experiment, resume=resume)
     with working("making agents"):
-        partners = partners_in(experiment.agents)
+        partners = partners_in(experiment.specs)
         weights = {} if resumed is None else frozen_weights_names(resumed, partners)
         env, population = make_agents(experiment, starts=state in ("missing", "begun"), weights=weights)
         earlier = make_earlier(experiment, env, population)
@@ -381,13 +382,14 @@ class _Stages:
         evaluations = Evaluations(run.directory, run.experiment, run.env, run.population)
         with _loggers(run.experiment, run.directory, resumes=run.resume) as loggers:
             table = EpisodeTable(run.directory / "episodes.parquet", resumable=True)
-            with table, ProgressBar.of(run.experiment) as progress_bar:
+            with table, ProgressBar.of(run.experiment, run.population.calls.in_words) as progress_bar:
                 training = train(
                     run.env,
                     run.population.learners,
                     run.experiment.schedule,
                     others=run.population.others,
                     decisions=run.population.decisions,
+                    governor=run.population.governor,
                     callbacks=[evaluations, table, progress_bar, *run.observers, *viewers, *loggers],
                     metrics=run.experiment.metrics,
                     earlier=run.earlier,
@@ -444,7 +446,8 @@ class _Stages:
     def summarise(self, training: Training, evaluation: pa.Table, figure: Path | None) -> None:
         """Print the summary of the run."""
         experiment = self.run.experiment
-        notes = filter(None, (findings_note(training.finite.reported), experiment.custom_code))
+        calls = self.run.population.calls.in_words()
+        notes = filter(None, (findings_note(training.finite.reported), experiment.custom_code, calls))
         course = ""
         if all(training.episodes_by_replica) and set(NEEDED) <= set(evaluation.column_names):
             course = course_of(self.run.directory, experiment.agents)
@@ -476,7 +479,7 @@ def _write_report(directory: Path, training: Training, times: Times) -> None:
     report: dict[str, Any] = {
         **times.report(training.times),
         "steps": training.steps,
-        "finished": datetime.now().astimezone().isoformat(timespec="seconds"),
+        "finished": time_now(),
         "episodes": episodes,
         "worlds": training.schedule.worlds,
         "threads": torch.get_num_threads(),

@@ -1,11 +1,11 @@
-"""Stored agents of earlier runs, read by `load`, and their policies."""
+"""Stored agents of earlier runs, read by `load`, their policies, and checks that runs have the same game."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import pyarrow as pa
@@ -18,21 +18,26 @@ from cprl import recurrent_state
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.env_state import load_transforms_state
-from cprl.envs.make_env import make_env, spaces_of
+from cprl.envs.make_env import make_env, spaces_of, stored_game
 from cprl.experiment import Experiment
 from cprl.networks.agent import acting_network
 from cprl.networks.finite import all_finite
 from cprl.networks.recurrent import state_cells_of
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.actors import LaneActor
+from cprl.policies.asking import CALLS, Calls
 from cprl.policies.decisions import ballot_sizes, stored_decisions
+from cprl.policies.governors import GovernorActor, Script, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
+from cprl.policies.language import LanguageActor
 from cprl.policies.rng import LaneRng, Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
 from cprl.population import (
     AgentSpec,
     Draw,
     Frozen,
+    GovernorSpec,
+    Language,
     Learning,
     OwnPast,
     Person,
@@ -46,15 +51,22 @@ from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, warn_of_changes
 from cprl.runs.weights import frozen_weights_name, weights_in
 from cprl.system.compat.tensordicts import unchecked_tensordict
-from cprl.values import Custom, instantiate, short_repr
+from cprl.values import Custom, describe_changes, instantiate, short_repr, to_config
+
+_MOST_DIFFERENCES: Final = 3
+"""The largest number of differences between two games that a message lists."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StoredAgent:
     """An agent that no longer learns: a scripted policy, a network and how it acts by it, or a pool."""
 
-    scripted: ScriptedPolicy | None = None
+    scripted: ScriptedPolicy | Script | None = None
     """The policy that it follows; None for an agent that acts by a network, or a pool."""
+    language: Language | None = None
+    """How a language model makes its plans, where it falls back to `scripted`; None without one."""
+    calls: Calls | None = field(default=None, repr=False)
+    """What keeps the calls of its model."""
     network: nn.Module | None = field(default=None, repr=False)
     stochastic: bool = False
     """True if the network outputs the logits of a policy; else it outputs action values."""
@@ -73,7 +85,7 @@ class StoredAgent:
     @property
     def kind(self) -> tuple[Any, ...]:
         """Return the kind of the agent; agents of one kind can be lanes of one actor."""
-        return self.scripted, self.stochastic, self.epsilon, self.algorithm
+        return self.scripted, self.language, self.stochastic, self.epsilon, self.algorithm
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -112,10 +124,26 @@ class LoadedRun:
     def specs(self) -> list[AgentSpec]:
         return specs_by_agent(self.experiment.agents, self.game.agents)
 
+    @property
+    def _governor(self) -> list[GovernorSpec]:
+        """Return the specification of the governor; [] without one."""
+        return [] if self.experiment.governor is None else [self.experiment.governor]
+
+    def governor(self, replicas: Sequence[int]) -> list[StoredAgent]:
+        """Return the governor of each of some replicas; [] without one."""
+        return [self.agent(self.game.agents, replica=replica) for replica in replicas if self._governor]
+
     @cached_property
     def spaces(self) -> Spaces:
         """Return the observations and actions of its agents, transforms included."""
         return spaces_of(self.env())
+
+    @cached_property
+    def calls(self) -> Calls:
+        """Return what keeps the calls of its language models, in its directory."""
+        calls = Calls()
+        calls.keep_in(self.path / CALLS)
+        return calls
 
     @property
     def playing(self) -> Game | Spaces:
@@ -141,12 +169,17 @@ class LoadedRun:
         return env
 
     def agent(self, agent: int, *, replica: int = 0) -> StoredAgent:
-        """Return an agent of a replica."""
-        if not 0 <= agent < self.game.agents:
-            raise ValueError(f"agent is {agent}; {self.path} has the agents 0 to {self.game.agents - 1}")
-        spec = self.specs[agent]
+        """Return an agent of a replica; its governor counts as the agent after the last one."""
+        specs = [*self.specs, *self._governor]
+        if not 0 <= agent < len(specs):
+            raise ValueError(f"agent is {agent}; {self.path} has the agents 0 to {len(specs) - 1}")
+        spec = specs[agent]
+        if isinstance(spec, Script):
+            return StoredAgent(scripted=spec)
         if isinstance(spec, Scripted):
             return StoredAgent(scripted=spec.policy)
+        if isinstance(spec, Language):
+            return language_agent(spec, self.calls)
         if isinstance(spec, Person):
             raise ValueError(
                 f"agent {agent} of {self.path} is a person: people cannot be played again; allowed: cprl "
@@ -193,11 +226,23 @@ class LoadedRun:
         """Return the policies of a replica's agents for several worlds; trained agents explore as in
         evaluation if asked to, with random numbers from the seed."""
         agents = [[self.agent(agent, replica=replica)] for agent in range(self.game.agents)]
-        return stored_policies(agents, self.playing, replicas=[replica], worlds=worlds, seed=seed)
+        return stored_policies(
+            agents,
+            self.playing,
+            replicas=[replica],
+            worlds=worlds,
+            seed=seed,
+            governor=self.governor([replica]),
+        )
 
     def episodes(self) -> pa.Table:
         """Return the table of episodes; see `cprl.runs.episodes.read_episodes`."""
         return read_episodes(self.path)
+
+
+def language_agent(spec: Language, calls: Calls) -> StoredAgent:
+    """Return an agent for which a language model makes plans, and whose calls are kept."""
+    return StoredAgent(scripted=spec.fallback, language=spec, calls=calls)
 
 
 def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
@@ -238,19 +283,71 @@ def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
     return loaded
 
 
+def as_loaded(run: str | Path | LoadedRun) -> LoadedRun:
+    """Return a run as it is, or load it from its directory."""
+    return run if isinstance(run, LoadedRun) else load(run)
+
+
+def refuse_other_games(runs: Mapping[str, LoadedRun]) -> None:
+    """Raise a ValueError if a run has a different game or different transforms than the first run.
+
+    Args:
+        runs: the runs by the names that a refusal says.
+    """
+    first_name, *other_names = runs
+    first_run = runs[first_name]
+    for name in other_names:
+        run = runs[name]
+        both = f"{first_name} and {name}"
+        refuse_unlike(both, first_run.experiment.game, run.experiment.game)
+        refuse_unlike(both, first_run.experiment.transforms, run.experiment.transforms, "transforms")
+        learned = differing_entries(first_run.transforms_state, run.transforms_state)
+        if learned:
+            raise ValueError(f"{both}: the learned state of transforms differs: {learned}")
+
+
+def differing_entries(state: Mapping[str, Any], other_state: Mapping[str, Any]) -> list[str]:
+    """Return the names of the entries of a transforms' state that another state lacks or has with another
+    value."""
+    return [
+        name
+        for name, value in state.items()
+        if name not in other_state
+        or not torch.equal(torch.as_tensor(value), torch.as_tensor(other_state[name]))
+    ]
+
+
+def refuse_unlike(names: str, game: Any, other_game: Any, path: str = "") -> None:
+    """Raise a ValueError that says where two games, or two lists of transforms, differ.
+
+    Args:
+        names: the names of the two runs, e.g. "a and b".
+        path: where the differences are; by default the game's class.
+    """
+    config = to_config(stored_game(game))
+    other_config = to_config(stored_game(other_game))
+    lines = describe_changes(config, other_config, path or type(game).__name__)
+    if lines:
+        raise ValueError(
+            f"{names} have different games: {'; '.join(lines[:_MOST_DIFFERENCES])}; allowed: the same game"
+        )
+
+
 def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module]:
     networks = {}
     refusal = no_weights = f"{run.weights_from} holds no weights of this run"
     try:
         for name, state in weights.items():
             lane = name if "/" in name else f"replica_0/{name}"
-            spec = run.specs[int(lane.split("/")[1].removeprefix("agent_"))]
+            agent = int(lane.split("/")[1].removeprefix("agent_"))
+            spec = [*run.specs, *run._governor][agent]
             if isinstance(spec, Pool) and spec.own_past is not None:
                 spec = run.specs[spec.own_past.agent]
             if not isinstance(spec, Learning | Team):
                 raise ValueError(f"{lane} is the network of an agent that does not learn")
             refusal = f"{run.path / RECIPE_FILE}: a network cannot be made"
-            networks[lane] = acting_network(instantiate(spec.algorithm).make_network(run.spaces))
+            spaces = run.spaces if agent < run.game.agents else governor_spaces(run.game)
+            networks[lane] = acting_network(instantiate(spec.algorithm).make_network(spaces))
             refusal = no_weights
             networks[lane].load_state_dict(state)
     except Exception as error:
@@ -290,12 +387,14 @@ def stored_policies(
     replicas: Sequence[int],
     worlds: int,
     seed: int,
+    governor: Sequence[StoredAgent] = (),
 ) -> JointPolicy:
     """Return the policies of stored agents of some replicas; agents of one kind are lanes of one actor.
 
     Args:
         agents: the stored agents, by agent and replica.
         seed: the seed of random numbers, with the replica and the agent.
+        governor: the stored governor of each replica; empty where the first option stays in force.
     """
     by_index = dict(enumerate(agents))
     seeds = partial(lane_seeds, seed, replicas=replicas, purpose=Purpose.EVALUATION)
@@ -304,7 +403,40 @@ def stored_policies(
         stored = decision_values(by_index)
         decisions = stored_decisions(playing, stored, replicas=replicas, worlds=worlds, seed=seed)
     actors = stored_actors(by_index, playing, seeds=seeds, worlds=worlds, stacks=True)
-    return JointPolicy(actors, decisions=decisions)
+    governs = None
+    if isinstance(playing, Game) and governor:
+        lanes = seeds(agents=[playing.agents])
+        governs = stored_governor(playing, governor, seeds=lanes, worlds=worlds)
+    return JointPolicy(actors, decisions=decisions, governor=governs)
+
+
+def stored_governor(
+    game: Game,
+    stored: Sequence[StoredAgent],
+    *,
+    seeds: Sequence[Sequence[int]],
+    worlds: int,
+    from_turn: int = 0,
+) -> GovernorActor:
+    """Return the actor of a governor that does not learn.
+
+    Args:
+        stored: the governor of each replica.
+        seeds: the seed of each replica.
+        from_turn: see `GovernorActor`.
+    """
+    assert game.governor is not None
+    by: Any = stored[0].scripted
+    if by is None:
+        (by,) = stored_actors(
+            {game.agents: stored},
+            governor_spaces(game),
+            kinds={game.agents: stored[0].kind},
+            seeds=lambda agents: seeds,
+            worlds=worlds,
+            stacks=True,
+        ).values()
+    return GovernorActor(game.governor, by, from_turn=from_turn)
 
 
 def decision_values(agents: Mapping[int, Sequence[StoredAgent]]) -> dict[int, list[Tensor]]:
@@ -357,6 +489,9 @@ def stored_actors(
         lanes = list(chain.from_iterable(by_replica))
         size: dict[str, Any] = {"seeds": seeds(agents=indices), "agents": len(indices), "worlds": worlds}
         stored = lanes[0]
+        if stored.language is not None and stored.calls is not None:
+            actors[tuple(indices)] = LanguageActor(stored.language, playing, calls=stored.calls, **size)
+            continue
         if stored.scripted is not None:
             actors[tuple(indices)] = scripted_lanes(stored.scripted, playing, **size)
             continue
@@ -415,6 +550,11 @@ class PoolActor(nn.Module):
         present: Callable[[], Sequence[StoredAgent]] = list,
     ) -> None:
         super().__init__()
+        if any(stored.language for replicas in opponents for stored in replicas):
+            raise ValueError(
+                "an opponent of a Pool plays by a language model, which would be asked in episodes of others "
+                "too; allowed: agents that learned, or follow a script"
+            )
         self.rng = LaneRng(seeds, worlds)
         self._playing = playing
         self._seeds = seeds

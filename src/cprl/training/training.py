@@ -31,6 +31,7 @@ from cprl.runs.checkpoints import Checkpointer
 from cprl.runs.files import TRAINING_STATE_FORMAT
 from cprl.runs.schedule import Schedule
 from cprl.system.times import Times
+from cprl.training.governing import Governing
 from cprl.training.learning import (
     LaneLosses,
     ShapedReturns,
@@ -114,6 +115,7 @@ class Training:
             index.
         decisions: the decisions of all agents on the game's ballots, and how they learn them; see
             `Game.decisions`.
+        governor: decides, and learns, in a game with a `Governor`; None leaves its first option in force.
         callbacks: called after each turn and each episode, in this order; see `Callback`.
         metrics: custom metrics, see `cprl.measuring.EpisodeTracker`.
         make_collector: makes the collector; those of TorchRL are several times slower, and cannot be resumed.
@@ -129,6 +131,7 @@ class Training:
         *,
         others: Mapping[ActorAgents, nn.Module] | None = None,
         decisions: Decider | None = None,
+        governor: Governing | None = None,
         callbacks: Sequence[Any] = (),
         metrics: Sequence[Custom] = (),
         make_collector: MakeCollector = StepCollector,
@@ -150,6 +153,7 @@ class Training:
         self.learners = dict(learners)
         self.others = dict(others or {})
         self.decisions = decisions
+        self.governor = governor
         self.replicas = check_agents(env, spaces.agents, schedule.worlds, self.learners, self.others)
         for learner in self.learners.values():
             schedule.refuse_rollouts(getattr(learner.settings, "rollout_steps", schedule.update_every))
@@ -159,7 +163,11 @@ class Training:
         actors: dict[ActorAgents, nn.Module] = {
             agents: learner.actor for agents, learner in self.learners.items()
         }
-        policy = JointPolicy({**actors, **self.others}, decisions=decisions)
+        policy = JointPolicy(
+            {**actors, **self.others},
+            decisions=decisions,
+            governor=None if governor is None else governor.actor,
+        )
         self._collector = make_collector(self.env, policy)
         if earlier and not isinstance(self._collector, StepCollector):
             raise ValueError(
@@ -286,6 +294,8 @@ class Training:
         self.finite.add(turn)
         for learner in self.learners.values():
             learner.store(turn)
+        if self.governor is not None:
+            self.governor.store(turn)
         self._shaped_returns.add()
 
     def _update_learners(self) -> None:
@@ -311,6 +321,9 @@ class Training:
         has_ended[worlds] = True
         for learner in self.learners.values():
             learner.end_episode(has_ended)
+        if self.governor is not None:
+            for world, numbers in zip(worlds, learned, strict=True):
+                numbers |= self.governor.numbers(world // self.schedule.worlds, self.schedule.worlds)
         return learned
 
     def _record_episodes(self, ended: Sequence[Episode], learned: Sequence[dict[str, float]]) -> None:
@@ -361,6 +374,7 @@ class Training:
             "learners": list(self.learners.values()),
             "others": list(self.others.values()),
             "decisions": [] if self.decisions is None else [self.decisions],
+            **({} if self.governor is None else {"governor": [self.governor]}),
             "losses": list(self._losses.values()),
             "wanted": [self._shaped_returns],
             "tracker": [self._tracker],
@@ -455,6 +469,7 @@ def train(
     *,
     others: Mapping[ActorAgents, nn.Module] | None = None,
     decisions: Decider | None = None,
+    governor: Governing | None = None,
     callbacks: Sequence[Any] = (),
     metrics: Sequence[Custom] = (),
     make_collector: MakeCollector = StepCollector,
@@ -479,6 +494,7 @@ def train(
         schedule,
         others=others,
         decisions=decisions,
+        governor=governor,
         callbacks=callbacks,
         metrics=metrics,
         make_collector=make_collector,

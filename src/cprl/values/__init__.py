@@ -215,10 +215,14 @@ def matches_type(value: Any, hint: Any) -> bool:
 def _convert(value: Any, hint: Any) -> Any:
     """Return a value that matches an annotated type, as plain Python; raise `_TypeMismatchError` for
     others."""
-    origin = get_origin(hint)
-    inner = get_args(hint)
     if hint is Any:
         return value
+    if hint is int:
+        return _to_int(_to_plain(value))
+    if hint is float:
+        return _to_float(_to_plain(value))
+    origin = get_origin(hint)
+    inner = get_args(hint)
     if origin is Annotated:
         return _to_annotated(value, *inner)
     if origin in (Union, UnionType):
@@ -229,10 +233,6 @@ def _convert(value: Any, hint: Any) -> Any:
         return _to_literal(_to_plain(value), inner)
     if hint in _PLAIN_TYPES:
         value = _to_plain(value)
-    if hint is int:
-        return _to_int(value)
-    if hint is float:
-        return _to_float(value)
     if hint is Custom:
         value = as_custom(value)
     if isinstance(value, type) or not isinstance(value, origin or hint):
@@ -288,6 +288,8 @@ def _to_tuple(value: Any, inner: tuple[Any, ...]) -> tuple[Any, ...]:
 
 def _to_plain(value: Any) -> Any:
     """Return an array as a list, a scalar of numpy or torch as Python's; return anything else unchanged."""
+    if type(value) in _PLAIN_TYPES:
+        return value
     if isinstance(value, str):
         return str.__str__(value)  # turns a subclass of str into str
     if not isinstance(value, type) and callable(getattr(value, "tolist", None)):
@@ -387,10 +389,16 @@ def to_config(value: object, where: str = "value") -> Any:
 
 
 def _to_table(value: object, where: str) -> Any:
+    kind = type(value)
+    if kind in _PLAIN_TYPES and kind is not float:
+        return value
+    if isinstance(value, float):
+        if isfinite(value):
+            return float(value)
+        raise ValueError(f"{where} is {value}; allowed: a finite number")
     if isinstance(value, Custom):
         table = {"kind": "Custom", "target": value.target, "arguments": dict(value.arguments)}
         return {**table, "live": value.live} if value.live else table
-    kind = type(value)
     is_stored = is_dataclass(value) and KINDS.get(kind.__name__) is kind
     if is_stored or (isinstance(value, Value) and not kind.__module__.startswith("cprl.")):
         entries = {name: _to_table(getattr(value, name), f"{where}.{name}") for name in hints_of(kind)}
@@ -399,11 +407,7 @@ def _to_table(value: object, where: str) -> Any:
         return _to_table(replace(custom_of(kind), arguments=entries), where)
     if isinstance(value, tuple | list):
         return [_to_table(entry, f"{where}[{index}]") for index, entry in enumerate(value)]
-    if value is None or isinstance(value, bool):
-        return value
-    if isinstance(value, float) and not isfinite(value):
-        raise ValueError(f"{where} is {value}; allowed: a finite number")
-    for plain in (int, float, str):
+    for plain in (int, str):
         if isinstance(value, plain):
             return plain(value)
     raise ValueError(_not_stored(value, where))

@@ -315,13 +315,17 @@ def refuse_other_keys(value: Any, *, most: int = MOST_NESTED, depth: int = 0) ->
     deep for recursive functions."""
     if depth > most:
         raise ValueError(f"it is nested more than {most} deep")
+    if isinstance(value, str | float | int):
+        return
     if isinstance(value, Mapping):
         for key in value:
             if not isinstance(key, str):
                 raise TypeError(f"a table has the key {key!r}; allowed: text")
-    if isinstance(value, Mapping | list | tuple):
-        for entry in value.values() if isinstance(value, Mapping) else value:
-            refuse_other_keys(entry, most=most, depth=depth + 1)
+        value = value.values()
+    elif not isinstance(value, list | tuple):
+        return
+    for entry in value:
+        refuse_other_keys(entry, most=most, depth=depth + 1)
 
 
 def _to_json(value: object) -> Any:

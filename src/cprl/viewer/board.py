@@ -37,9 +37,8 @@ _MARK_WIDTH_CELLS: Final = 0.09
 """The width of the ring or the stripe that distinguishes agents of the same hue, in cells."""
 _DIGIT_POINT_CELLS: Final = 0.09
 """The largest distance between two points of a digit, in cells."""
-_ROTATIONS: Final = np.array([[(1, 0), (0, 1)], [(0, 1), (-1, 0)], [(-1, 0), (0, -1)], [(0, -1), (1, 0)]])
-"""int [4, 2, 2]: for each heading, the directions (x, y) to which right and down of an agent that faces up
-turn."""
+_TURNS: Final = np.array([[1], [1j], [-1], [-1j]])
+"""For each heading the factor that turns a point x + 1j * y of an agent that faces up; y grows downwards."""
 
 
 class Glyphs(NamedTuple):
@@ -115,8 +114,8 @@ def number(agent: int) -> list[Float32]:
 
 def _rotated(*corners: tuple[float, float]) -> Float32:
     """Rotate a line of an agent that faces up to each of the four headings: float32 [4, corners, 2]."""
-    rotated: Float32 = np.einsum("pk,hkd->hpd", np.array(corners), _ROTATIONS).astype(np.float32)
-    return rotated
+    turned = _TURNS * (np.array(corners) @ (1, 1j))
+    return np.stack([turned.real, turned.imag], -1).astype(np.float32)
 
 
 def _digit_scale(agent: int, *, room: float) -> float:
@@ -272,16 +271,17 @@ def _line_columns(lines: Glyphs, frames: Frames) -> Any:
 def _out_of_play_columns(frames: Frames) -> Columns:
     """Return the columns of a hollow square around each agent out of play, and of its number.
 
-    A number is left out where another agent's number stands. A square's label names the agent that tagged
-    this one; the viewer shows it when the mouse is on the square.
+    A number is left out where an agent in play, or one of a lower index, has its number. A square's label
+    names the agent that tagged this one; the viewer shows it when the mouse is on the square.
     """
     row = frames["row"]
     col = frames["col"]
     out = ~frames["in_play"]
     tagged_by = frames["tagged_by"]
-    has_number = out & ~_shares_cell_with_earlier(row, col, out)
-    cells = [np.where(out, row, 0), np.where(out, col, 0)]
-    changed = _changes(np.concatenate([out, np.where(out, tagged_by, 0), has_number, *cells], 1))
+    is_same_cell = (row[:, :, None] == row[:, None]) & (col[:, :, None] == col[:, None])
+    is_drawn_first = np.tri(row.shape[1], k=-1, dtype=np.bool_) | ~out[:, None]
+    has_number = out & ~(is_same_cell & is_drawn_first).any(2)
+    changed = _changes(np.concatenate([out, out * tagged_by, has_number, out * row, out * col], 1))
     out = out[changed]
     centres = centres_of(frames)[changed]
     rgb = np.array([agent_colour(agent) for agent in range(out.shape[1])], np.uint8)
@@ -295,20 +295,6 @@ def _out_of_play_columns(frames: Frames) -> Columns:
     lines, agent, counts = numbers.place(centres, frames["heading"][changed], has_number[changed])
     digits = rr.LineStrips2D.columns(strips=lines, colors=rgb[agent]).partition(counts)
     return {"out": (changed, squares), "out/numbers": (changed, digits)}
-
-
-def _shares_cell_with_earlier(row: NDArray[Any], col: NDArray[Any], out: Bool) -> Bool:
-    """Return whether each agent's cell, bool [T, N], holds an agent in play or one of a lower index.
-
-    Args:
-        row: int [T, N].
-        col: int [T, N].
-        out: bool [T, N], the agents that are out of play.
-    """
-    is_same_cell = (row[:, :, None] == row[:, None]) & (col[:, :, None] == col[:, None])
-    is_drawn_first = np.tri(row.shape[1], k=-1, dtype=np.bool_) | ~out[:, None]
-    shares: Bool = (is_same_cell & is_drawn_first).any(2)
-    return shares
 
 
 def centres_of(frames: Frames) -> Float32:

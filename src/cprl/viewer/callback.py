@@ -28,10 +28,10 @@ from cprl.values import instantiate
 from cprl.viewer.frames import FrameSchedule, Wall
 from cprl.viewer.header import CompilingNotice, Events, Header, HeaderView
 from cprl.viewer.logger import RerunLogger, recording_id
-from cprl.viewer.page import RECORDING_FILE, recordings_of
+from cprl.viewer.page import RECORDING_FILE, recording_file, recordings_of
 from cprl.viewer.pictures import Pictures, Samples, borders
 from cprl.viewer.scene import Scene, missing_in, plotted_numbers, scene_of
-from cprl.viewer.view import Exhibit, JointActions, Learning, Numbers, Plots, View
+from cprl.viewer.view import Exhibit, JointActions, Numbers, Plots, View
 
 _MOST_EPISODES_BETWEEN: Final = 50
 """The largest number of episodes between two pictures of visits, stock and Lorenz curve."""
@@ -109,21 +109,19 @@ class ViewerCallback:
             )
             scene = scene_of(commons, curves, is_replay=is_replay, size=size)
         self._earlier = [] if file_name else recordings_of(run)
-        new_file = f"run-{len(self._earlier) + 1}.rrd" if self._earlier else RECORDING_FILE
         self.logger = RerunLogger(
             title,
             run,
             curves=scene or curves,
             live=live,
             exhibits=exhibit is not None and scene is not None,
-            file_name=file_name or new_file,
+            file_name=file_name or recording_file(len(self._earlier) + 1),
             recording_id=recording_id(run, file_name or RECORDING_FILE),
         )
         self.schedule = FrameSchedule(commons, self.logger, episodes=-(-episodes // worlds))
         self._turn = 0
         self._episode = 0
         """The number of episodes that all replicas have ended."""
-        self._changes_game = bool(earlier)
         recipe = recipe or {}
         self._custom_rules = custom_rules_in(recipe)
         self.logger.log_hparams({"run": run.name, **recipe})
@@ -133,7 +131,7 @@ class ViewerCallback:
         for event in events:
             self.logger.log_text(event)
         self.header_view: HeaderView | None = None
-        self.exhibition: View | None = None
+        self.exhibition: Any = None
         """The view that plays the current policy for live viewers; None if nothing is exhibited."""
         picture_period = max(1, min(_MOST_EPISODES_BETWEEN, episodes // _PICTURES_OF_A_SHORT_RUN))
         self._views: list[View] = [
@@ -144,7 +142,13 @@ class ViewerCallback:
         if curves.joint:
             self._views.append(JointActions(self.logger, actions=action_count(env)))
         if commons is not None:
-            self._views += self._board_views(commons, exhibit)
+            regions = regions_of(commons.game)
+            if regions and not earlier:
+                self.logger.log_static("world/regions", borders(regions))
+        served = self.logger.live
+        if exhibit is not None and served is not None and served.exhibition is not None:
+            self.exhibition = exhibit(env, self.logger)
+            self._views.append(self.exhibition)
         if not is_replay:
             header = Header(
                 curves=self.logger.curves, episodes=episodes, rules=self._rules(commons), is_about=is_about
@@ -190,22 +194,12 @@ class ViewerCallback:
         game = None if commons is None else commons.game
         return ", ".join(filter(None, (rules_of(game), self._custom_rules)))
 
-    def _board_views(self, commons: CommonsEnv, exhibit: Exhibit | None) -> Iterator[View]:
-        """Yield the exhibition, if there is one; log the borders of regions."""
-        regions = regions_of(commons.game)
-        if regions and not self._changes_game:
-            self.logger.log_static("world/regions", borders(regions))
-        live = self.logger.live
-        if exhibit is not None and live is not None and live.exhibition is not None:
-            self.exhibition = exhibit(self.env, self.logger)
-            yield self.exhibition
-
     def _training_views(
         self, commons: CommonsEnv | None, header: Header, picture_period: int
     ) -> Iterator[View]:
         """Yield the views that a training has and a replay lacks."""
         logger = self.logger
-        scene = self.logger.scene
+        scene = logger.scene
         samples = None
         if commons is not None and scene is not None:
             if scene.boards > 1:
@@ -282,11 +276,11 @@ class ViewerCallback:
     def _set_time(self, episode: int) -> None:
         self.logger.set_time(step=self._turn * self.logger.curves.worlds, episode=episode)
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         """Pass an episode of one world to the views."""
         self._set_time(self._episode)
         for view in self._views:
-            view.on_episode(episode, learning)
+            view.on_episode(episode)
 
     def on_numbers(self, episode: int, numbers: Numbers) -> None:
         """Log the numbers of an episode that all replicas have ended."""
@@ -298,7 +292,10 @@ class ViewerCallback:
 
     def seen_at_random(self, env: EnvBase, policy: Policy) -> Policy:
         """Return the policy of random play; live viewers see its first world until the training begins."""
-        return policy if self.exhibition is None else self.exhibition.watch_random_play(env, policy)
+        if self.exhibition is None:
+            return policy
+        watched: Policy = self.exhibition.watch_random_play(env, policy)
+        return watched
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
         """Compare the training with these episodes of random play in header, label, plots and an event."""

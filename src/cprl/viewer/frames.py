@@ -21,7 +21,7 @@ from cprl.viewer.board import Frames, boards, image_format
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import DIED, TEXT
 from cprl.viewer.scene import Scene, boards_of, windows_of
-from cprl.viewer.view import Learning, View, has_died
+from cprl.viewer.view import View, has_died
 
 FRAMES_BYTES: Final = 45_000_000
 """About the size of a file's regular frames; the frames after new bests add to it."""
@@ -155,7 +155,7 @@ class FrameSchedule(View):
         if count >= _MOST_FRAMES or (waited_s > _SEND_PERIOD_S and count >= _FEWEST_FRAMES):
             self.close()
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode) -> None:
         if episode.world == 0:
             self._ended += 1
             self.was_on = self.is_on
@@ -247,7 +247,7 @@ class Wall(View):
             if self._logger.is_live:
                 self._log([self._row(self._logger.frames)], live_only=True)
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode) -> None:
         """Remember whether the board has died; log the rows of the first world's episode."""
         if episode.world < len(self._died):
             self._died[episode.world] = bool(has_died(episode))

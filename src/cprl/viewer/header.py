@@ -23,7 +23,7 @@ from cprl.viewer.frames import FrameSchedule
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import EXPLORATION_STRIP, HEADER, LABEL_STRIP, SETTLED
 from cprl.viewer.scene import Curves
-from cprl.viewer.view import Learning, Numbers, View, has_died
+from cprl.viewer.view import Numbers, View, has_died
 
 _HARVEST: Final = logged(COLLECTIVE_RETURN)
 
@@ -229,7 +229,7 @@ class HeaderView(View):
         if not self._ended:
             self._logger.log_document(HEADER, self.header.begins(BEGINS, self.course.random_play))
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode) -> None:
         income = _income(episode)
         died = has_died(episode)
         self.course.add(income, replica=episode.replica, world=episode.world, has_died=died)
@@ -351,7 +351,7 @@ class Events(View):
         self._has_seen_death = False
         self._ended = 0
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode) -> None:
         if episode.world:
             return
         event = ""

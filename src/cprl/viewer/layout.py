@@ -116,7 +116,6 @@ def styles(curves: Curves) -> dict[str, Any]:
 
 def _summary_styles(curves: Curves) -> dict[str, Any]:
     """Return the styles of lines that every recording may have, beside metrics and agents."""
-    mean = f"mean of {curves.mean_over} episodes"
     lines = {
         SPEED: _line("steps per second", GREY),
         f"{EVALUATION_FOLDER}/greedy_return": _line("greedy, evaluated", ORANGE),
@@ -124,7 +123,7 @@ def _summary_styles(curves: Curves) -> dict[str, Any]:
         "turn/stock": _line("apples", PALETTE[APPLE]),
     }
     if curves.unit == "return":
-        lines[INCOME] = _running_mean(mean, ORANGE, curves.replicas)
+        lines[INCOME] = _running_mean(curves.mean, ORANGE, curves.replicas)
         lines[f"{RANDOM_PLAY_FOLDER}/{INCOME}"] = _line("random play", GREY)
     return lines
 
@@ -134,7 +133,7 @@ def _metric_styles(curves: Curves) -> dict[str, Any]:
     lines = {}
     for metric in curves.metrics:
         is_alone = bool(metric in METRICS and METRICS[metric].plot)
-        name = f"mean of {curves.mean_over} episodes"
+        name = curves.mean
         if is_alone or metric.startswith(INSTITUTIONS):
             name = METRICS[metric].words
         lines[logged(metric)] = _running_mean(name, colour(metric), curves.replicas, is_alone=is_alone)
@@ -327,7 +326,7 @@ def _overview(curves: Curves, *, live: bool) -> Any:
         income = _metric(curves, COLLECTIVE_RETURN, is_explained=True)
     else:
         entities = [INCOME, f"{RANDOM_PLAY_FOLDER}/{INCOME}", f"{EVALUATION_FOLDER}/return"]
-        income = _plot(f"Income of all agents together; {curves.bold}", entities, has_legend=False)
+        income = _plot(f"Income of all agents together; bold: {curves.mean}", entities, has_legend=False)
     if not isinstance(curves, Scene):
         columns = [rrb.Vertical(income, _returns(curves))]
         if curves.joint:
@@ -481,7 +480,7 @@ def _metric(curves: Curves, metric: str, *, is_explained: bool = False) -> Any:
     entities = [logged(metric), f"{RANDOM_PLAY_FOLDER}/{metric}", f"{EVALUATION_FOLDER}/{metric}"]
     name = title(metric) if is_custom_metric(metric) else capitalised(title(metric))
     if is_explained:
-        name += f"; {curves.bold}"
+        name += f"; bold: {curves.mean}"
     is_share = metric in METRICS and METRICS[metric].unit == SHARE_UNIT
     return _plot(name, entities, share=is_share, has_legend=False)
 

@@ -8,7 +8,6 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from functools import cache, partial
 from operator import methodcaller
 from pathlib import Path
@@ -316,15 +315,26 @@ def served(files: Sequence[Path]) -> Iterator[WebViewer]:
     headers as the present while they load the history.
     """
     exit_in_time()
-    contents = _read_files(files)
-    recording = _new_recording(contents.application, contents.recording_id, send_properties=False)
-    source = _serve(recording, _FILES_MEMORY, contents.layout)
+    readable, complete = _readers_of(files)
+    application = "cut"  # not that of runs, so that the layout which a viewer keeps for runs stays as it is
+    recording_id = "cut"
+    header = None
+    layout = None
+    if complete:
+        newest, header = _newest_header(complete)
+        store = newest.recordings()[0]
+        application = store.application_id
+        recording_id = store.recording_id
+        for blueprint in newest.blueprints()[:1]:
+            layout = StoredLayout(newest.stream(store=blueprint))
+    recording = _new_recording(application, recording_id, send_properties=False)
+    source = _serve(recording, _FILES_MEMORY, layout)
     stream = LiveStream("recording", recording, period_s=0.0, history_s=0.0)
     page = WebViewer(source, opened=stream.show_loading)
     try:
-        if contents.header is not None:
-            stream.call(partial(stream.send_text, name=HEADER, text=contents.header))
-        for path in contents.readable_files:
+        if header is not None:
+            stream.call(partial(stream.send_text, name=HEADER, text=header))
+        for path in readable:
             stream.call(methodcaller("log_file_from_path", path))
         yield page
     finally:
@@ -332,47 +342,25 @@ def served(files: Sequence[Path]) -> Iterator[WebViewer]:
         stream.close()
 
 
-@dataclass
-class _FileContents:
-    """What the server of some recording files needs to know about them."""
-
-    readable_files: list[Path]
-    application: str = "cut"
-    """The application id. Files that break off have one that differs from that of runs, so that the layout
-    which a viewer keeps for runs stays as it is."""
-    recording_id: str = "cut"
-    header: str | None = None
-    """The newest header, a Markdown text."""
-    layout: StoredLayout | None = None
-
-
-def _read_files(files: Sequence[Path]) -> _FileContents:
-    """Return the ids, the newest header and the layout of recordings; leave out files that are no recordings.
+def _readers_of(files: Sequence[Path]) -> tuple[list[Path], list[RrdReader]]:
+    """Return the files that are recordings, and the readers of those that do not break off.
 
     Raises:
         ValueError: if no file is a recording.
     """
-    readable_files = []
+    readable = []
     complete = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the recording of a run that was killed has no footer
         for path in files:
             with suppress(RuntimeError):
                 reader = RrdReader(path)  # raises if the file is no recording
-                readable_files.append(path)
+                readable.append(path)
                 reader.recordings()  # raises if the file breaks off; viewers get the part before the break
                 complete.append(reader)
-        if not readable_files:
-            raise ValueError(f"no recording can be read of {', '.join(map(str, files))}")
-        contents = _FileContents(readable_files)
-        if complete:
-            newest, contents.header = _newest_header(complete)
-            store = newest.recordings()[0]
-            contents.application = store.application_id
-            contents.recording_id = store.recording_id
-            for blueprint in newest.blueprints()[:1]:
-                contents.layout = StoredLayout(newest.stream(store=blueprint))
-    return contents
+    if not readable:
+        raise ValueError(f"no recording can be read of {', '.join(map(str, files))}")
+    return readable, complete
 
 
 def _newest_header(readers: Sequence[RrdReader]) -> tuple[RrdReader, str | None]:

@@ -17,10 +17,9 @@ from torch import Tensor
 from torchrl.record.loggers import Logger
 
 from cprl.runs.files import read_json
-from cprl.runs.recipe import RECIPE_FILE
+from cprl.runs.recipe import RECIPE_FILE, recipe_table
 from cprl.system.compat.recordings import end_recordings
 from cprl.system.output import console, legible
-from cprl.values import short_repr
 from cprl.viewer.board import Frames, frame_columns
 from cprl.viewer.layout import layout, static_parts
 from cprl.viewer.live import (
@@ -44,8 +43,6 @@ _LIVE_PERIOD_S: Final = 4.0
 Python's global lock."""
 _FILE_PERIOD_S: Final = 60.0
 """Seconds between two writes to the file. Each write adds about 40 kB, even for few numbers."""
-_LONGEST_VALUE: Final = 90
-"""The longest text of a value in the recipe's table, in characters; recipe.json has the whole text."""
 
 _Integers: TypeAlias = "Sequence[int] | NDArray[np.integer[Any]]"
 RowTimes: TypeAlias = tuple[_Integers, _Integers, _Integers]
@@ -62,44 +59,6 @@ def recording_id(run: Path, file_name: str) -> str | None:
     recipe = read_json(run / RECIPE_FILE)
     unchanging = {name: value for name, value in recipe.items() if name not in ("experiment", "extended")}
     return str(uuid.uuid5(uuid.NAMESPACE_URL, file_name + json.dumps(unchanging, sort_keys=True)))
-
-
-def recipe_table(recipe: Mapping[Any, Any]) -> str:
-    """Return a recipe as a Markdown table with one row per value, such as `| rules.beam_length_cells | 10 |`.
-
-    Texts of several lines, such as drawn boards, follow below the table. An entry of a list that equals the
-    first entry is one row that refers to the first.
-    """
-    rows = []
-    long_texts = []
-    for path, value in _values_by_path(recipe, ""):
-        if isinstance(value, str) and "\n" in value:
-            long_texts.append(f"`{path}`\n\n```\n{value}\n```")
-            continue
-        text = value if isinstance(value, str) else short_repr(value)
-        if len(text) > _LONGEST_VALUE:
-            text = f"{text[:_LONGEST_VALUE]} ..."
-        rows.append(f"| {_table_cell(path)} | {_table_cell(text)} |")
-    return "\n\n".join(["\n".join(["| place | value |", "| --- | --- |", *rows]), *long_texts])
-
-
-def _values_by_path(value: Any, path: str) -> Iterator[tuple[str, Any]]:
-    """Yield each value that holds no other values, with its dotted path: {"a": {"b": 1}} yields "a.b", 1."""
-    if isinstance(value, Mapping) and value:
-        for name, entry in value.items():
-            yield from _values_by_path(entry, f"{path}.{name}".removeprefix("."))
-    elif isinstance(value, list | tuple) and any(isinstance(entry, Mapping) for entry in value):
-        for index, entry in enumerate(value):
-            if index and entry == value[0]:
-                yield f"{path}.{index}", f"as {path}.0"
-            else:
-                yield from _values_by_path(entry, f"{path}.{index}")
-    else:
-        yield path, value
-
-
-def _table_cell(text: str) -> str:
-    return text.replace("|", "\\|").replace("\n", " ")
 
 
 def _time_columns(times: RowTimes) -> list[Any]:
@@ -133,15 +92,9 @@ def _send_rows(stream: Stream, rows_by_entity: Mapping[str, Sequence[BufferedRow
         if isinstance(values[0], str):
             columns = rr.TextDocument.columns(text=values)
         else:
-            columns = _line_columns(values)
+            columns = rr.Scalars.columns(scalars=np.concatenate(values)).partition(list(map(len, values)))
         recording.send_columns(entity, time_columns[times], columns)
     recording.flush(timeout_sec=FLUSH_TIMEOUT_S)
-
-
-def _line_columns(rows: Sequence[Sequence[float]]) -> Any:
-    """Return the columns of plotted lines: in each row one number per line."""
-    line_counts = list(map(len, rows))
-    return rr.Scalars.columns(scalars=np.concatenate(rows)).partition(line_counts)
 
 
 class RerunLogger(Logger):

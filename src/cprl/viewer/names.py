@@ -1,9 +1,7 @@
 """The names of the entities in a recording, and the colours that several of its parts share."""
 
-from collections.abc import Mapping
 from typing import Final
 
-from cprl.commons.cells import Colour
 from cprl.measuring import outcome
 from cprl.pictures.colours import BLUE, GREEN, GREY, ORANGE, VERMILION
 from cprl.pictures.decoding import UNSEEN
@@ -35,7 +33,7 @@ DIED: Final = VERMILION
 """The colour of a board that died: its last apple was taken before the time was up."""
 SETTLED: Final = "settled"
 """The state of agents that no longer explore, which is not drawn."""
-STATES: Final[Mapping[str, Colour]] = {
+STATES: Final = {
     outcome.BEGINS: (80, 80, 80),
     outcome.RISING: GREEN,
     outcome.RECOVERING: BLUE,

@@ -38,10 +38,15 @@ _RUN_UNTIL_STDIN_CLOSES: Final = '"$@" & read -r _; kill $!'
 server ends with this process, even if this process is killed."""
 
 
+def recording_file(number: int) -> str:
+    """Return the name of a recording of a run's training: run.rrd, run-2.rrd and so on."""
+    return RECORDING_FILE if number == 1 else f"run-{number}.rrd"
+
+
 def recordings_of(run: Path) -> list[Path]:
-    """Return the recordings of a run's training in their order: run.rrd, run-2.rrd and so on."""
-    names = (RECORDING_FILE if number == 1 else f"run-{number}.rrd" for number in itertools.count(1))
-    return list(itertools.takewhile(Path.exists, (run / name for name in names)))
+    """Return the recordings of a run's training in their order."""
+    paths = (run / recording_file(number) for number in itertools.count(1))
+    return list(itertools.takewhile(Path.exists, paths))
 
 
 class WebViewer:

@@ -1,14 +1,14 @@
 """Pictures that are drawn every some episodes of a training, and the borders of regions.
 
 The pictures show who tagged whom, where agents go, the stock over the turn, and the Lorenz curve. To add a
-picture, write a function from `PictureData` to Rerun's archetypes, and add it to `PICTURES` and to
+picture, write a function from `PictureData` to Rerun's archetypes, and add it to `Pictures` and to
 `cprl.viewer.layout`.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil
-from typing import Any, Final, Self, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import rerun as rr
@@ -16,15 +16,30 @@ from tensordict import TensorDictBase
 
 from cprl.commons.cells import GROUND, WALL
 from cprl.envs.commons_env import CommonsEnv
+from cprl.measuring.social import gini, lorenz_curve
 from cprl.measuring.tracker import Episode
 from cprl.pictures.colours import GREEN, GREY, ORANGE, PALETTE, PURPLE, agent_colour
-from cprl.pictures.image import OwnedRegions
+from cprl.pictures.image import OwnedRegions, region_colour
 from cprl.values.array_types import Bool, Float32, Float64, Int64, UInt8
 from cprl.viewer.board import RIM_CELLS
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import DIED, TEXT
-from cprl.viewer.scene import PLOT_HIGH, PLOT_WIDE, TITLE, Curves, Scene, boards_of
-from cprl.viewer.view import Learning, Numbers, View, has_died
+from cprl.viewer.scene import PLOT_HIGH, PLOT_WIDE, TITLE, Scene, boards_of
+from cprl.viewer.view import Numbers, View, has_died
+
+Archetypes: TypeAlias = Mapping[str, Any]
+"""Rerun's archetypes by entity."""
+
+
+class PictureData(NamedTuple):
+    """The data from which a picture is drawn."""
+
+    episodes: Sequence[Episode]
+    """The episodes of all replicas since the last picture, or the last `Picture.over` episodes."""
+    span: str
+    """The numbers of these episodes, e.g. "episodes 51 to 100"; of a resumed run those since the resume."""
+    first: "PictureData | None"
+    """The data of the first picture of this kind; None for the first one."""
 
 
 class Samples(View):
@@ -43,8 +58,10 @@ class Samples(View):
         scene = logger.curves
         assert isinstance(scene, Scene)
         self._logger = logger
-        self.episode_steps = env.game.rules.episode_steps
-        self.stride = ceil(self.episode_steps / self.MOST_SAMPLES)
+        steps = env.game.rules.episode_steps
+        self.stride = ceil(steps / self.MOST_SAMPLES)
+        self.axes = Axes("turn", "turn of the episode", steps, max(1, len(scene.sites)))
+        """The axes of the picture of the stock."""
         self.lines: list[list[tuple[int, int]]] = [[] for _ in range(scene.boards)]
         """The points (turn, stock) of each board's last episode."""
         self.died = [False] * scene.boards
@@ -55,6 +72,7 @@ class Samples(View):
         """Sample these worlds from now on; begin the visits anew."""
         now = env.worlds.now
         boards = scene.boards
+        self._scene = scene
         self._count = 0
         """The number of samples in the buffer."""
         arrays: list[Any] = [
@@ -94,7 +112,7 @@ class Samples(View):
         for board, stock_by_turn in enumerate(self._running_stock):
             stock_by_turn.update(zip(turn[:, board, 0].tolist(), stock[:, board, 0].tolist(), strict=True))
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode) -> None:
         if episode.world >= len(self.lines):
             return
         self.evaluate()
@@ -107,25 +125,33 @@ class Samples(View):
         self.lines[episode.world] = points
         self.died[episode.world] = bool(has_died(episode))
 
+    def draw_visit_maps(self, data: PictureData) -> Archetypes:
+        """Draw a map per agent of the first world: a cell's brightness shows how long the agent was there."""
+        self.evaluate()
+        panels = boards_of(self._scene, len(self.visits))
+        image = panels.join(visit_maps(self.visits, self._scene), PALETTE[GROUND])
+        texts = [f"{agent}: {data.span}" for agent in range(len(self.visits))]
+        self.visits[:] = 0
+        return {"visits": rr.Image(image), "visits/labels": _texts(panels.tops, texts)}
 
-@dataclass(frozen=True, kw_only=True)
-class PictureData:
-    """The data from which a picture is drawn."""
-
-    curves: Curves
-    """The numbers that are plotted; a `Scene` if the game has a board."""
-    samples: Samples | None
-    """The samples of the boards; None for a game without a board."""
-    episodes: Sequence[Episode] = ()
-    """The episodes of all replicas since the last picture, or the last `Picture.over` episodes."""
-    span: str = ""
-    """The numbers of these episodes, e.g. "episodes 51 to 100"; of a resumed run those since the resume."""
-    first: Self | None = None
-    """The data of the first picture of this kind."""
-
-
-Archetypes: TypeAlias = Mapping[str, Any]
-"""Rerun's archetypes by entity."""
+    def draw_stock(self, data: PictureData) -> Archetypes:
+        """Draw the stock over the turns of the last episode of each shown board, in orange if the board
+        died."""
+        boards = [board for board, line in enumerate(self.lines) if len(line) > 1]
+        if not boards:
+            return {}
+        owners = "each replica"
+        worlds = self._scene.worlds
+        if worlds > 1:
+            count = len(self.lines)
+            shown_worlds = "each world" if worlds == count else f"the first {count} worlds"
+            owners = f"{shown_worlds} of the first replica"
+        return self.axes.lines(
+            f"last episode of {owners}: {sum(self.died)} of {len(boards)} died (orange)",
+            [tuple(np.array(self.lines[board]).T) for board in boards],
+            colours=[DIED if self.died[board] else GREY for board in boards],
+            radii=0.5,
+        )
 
 
 @dataclass(frozen=True)
@@ -201,20 +227,6 @@ def draw_tags(data: PictureData) -> Archetypes:
     return {"tags": rr.Image(image.round().astype(np.uint8)), "tags/counts": _texts([*cells, *edges], texts)}
 
 
-def draw_visit_maps(data: PictureData) -> Archetypes:
-    """Draw a map per agent of the first world: a cell's brightness shows how long the agent was there."""
-    scene = data.curves
-    samples = data.samples
-    assert isinstance(scene, Scene)
-    assert samples is not None
-    samples.evaluate()
-    panels = boards_of(scene, len(scene.agents))
-    image = panels.join(visit_maps(samples.visits, scene), PALETTE[GROUND])
-    samples.visits[:] = 0
-    texts = [f"{agent}: {data.span}" for agent in range(len(scene.agents))]
-    return {"visits": rr.Image(image), "visits/labels": _texts(panels.tops, texts)}
-
-
 _DARKEST: Final = 0.35
 """The least brightness of a visited cell; the cell with the longest stay has brightness 1."""
 
@@ -242,57 +254,7 @@ def visit_maps(visits: Int64, scene: Scene) -> UInt8:
     return with_rim
 
 
-def _stock_axes(data: PictureData) -> Axes:
-    assert isinstance(data.curves, Scene)
-    assert data.samples is not None
-    return Axes("turn", "turn of the episode", data.samples.episode_steps, max(1, len(data.curves.sites)))
-
-
-def draw_stock(data: PictureData) -> Archetypes:
-    """Draw the stock over the turns of the last episode of each shown board, in orange if the board died."""
-    assert data.samples is not None
-    lines = data.samples.lines
-    died = data.samples.died
-    boards = [board for board, line in enumerate(lines) if len(line) > 1]
-    if not boards:
-        return {}
-    owners = "each replica"
-    worlds = data.curves.worlds
-    if worlds > 1:
-        shown_worlds = "each world" if worlds == len(lines) else f"the first {len(lines)} worlds"
-        owners = f"{shown_worlds} of the first replica"
-    return _stock_axes(data).lines(
-        f"last episode of {owners}: {sum(died)} of {len(boards)} died (orange)",
-        [tuple(np.array(lines[board]).T) for board in boards],
-        colours=[DIED if died[board] else GREY for board in boards],
-        radii=0.5,
-    )
-
-
-def lorenz_curve(harvest: Float64) -> Float64:
-    """Return the share of the harvest that the k agents with the least have together, for k = 0 to N.
-
-    Twice the area between the curve and the diagonal is the Gini coefficient, which is 1 - equality.
-
-    Args:
-        harvest: float [N], the apples of each agent.
-
-    Returns:
-        float [N + 1], from 0 to 1; NaN if there is no harvest.
-    """
-    total = harvest.sum()
-    if total <= 0:
-        return np.full(len(harvest) + 1, np.nan)
-    return np.concatenate([[0.0], np.sort(harvest).cumsum() / total])
-
-
-def gini(curve: Float64) -> float:
-    """Return the Gini coefficient of a Lorenz curve [N + 1], 0 for equal shares."""
-    return float(1 - (curve[1:] + curve[:-1]).sum() / (len(curve) - 1))
-
-
-def _lorenz_axes(data: PictureData) -> Axes:
-    return Axes("lorenz", "agents, the poorest first, %", 100.0, 100.0)
+_LORENZ_AXES: Final = Axes("lorenz", "agents, the poorest first, %", 100.0, 100.0)
 
 
 def draw_lorenz(data: PictureData) -> Archetypes:
@@ -313,7 +275,7 @@ def draw_lorenz(data: PictureData) -> Archetypes:
         f"(green: {first.span}, {gini(earliest):.2f}; grey: equal shares)"
     )
     lines = [(share, 100 * shares) for shares in (share / 100, earliest, curve)]
-    return _lorenz_axes(data).lines(title, lines, colours=[GREY, GREEN, ORANGE], radii=[0.3, 0.5, 1.0])
+    return _LORENZ_AXES.lines(title, lines, colours=[GREY, GREEN, ORANGE], radii=[0.3, 0.5, 1.0])
 
 
 def _lorenz_curves(data: PictureData) -> list[Float64]:
@@ -321,39 +283,28 @@ def _lorenz_curves(data: PictureData) -> list[Float64]:
     return [lorenz_curve(harvest) for harvest in harvests if harvest.sum() > 0]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class Picture:
-    """A kind of picture: the function that draws it, and when it is drawn."""
+    """A picture of a training: the function that draws it, and when it is drawn."""
 
     draw: Callable[[PictureData], Archetypes]
     """Draws the picture; returns an empty mapping if there is nothing to draw."""
-    is_available: Callable[[Curves], bool]
-    """Returns whether a game has the picture."""
-    every: int | None = None
-    """The number of episodes of a replica between two pictures; None for the period of `Pictures`."""
+    every: int
+    """The number of episodes of a replica between two pictures."""
     over: int = 0
     """The number of last episodes of a replica that the picture shows; 0 for all since the last picture."""
-    axes: Callable[[PictureData], Axes] | None = None
-    """Returns the axes of the picture; None for a picture without axes."""
+    axes: Axes | None = None
+    """The axes of the picture, if it has any."""
     is_sampled: bool = False
     """Whether the picture needs samples of boards, which are lost when a run is resumed."""
-
-
-def _has_board(curves: Curves) -> bool:
-    return isinstance(curves, Scene)
+    drawn: int = 0
+    """How many episodes all replicas had ended when it was drawn last."""
+    first: PictureData | None = None
+    """The data of the first picture."""
 
 
 TAGS_EPISODES: Final = 50
 """The number of last episodes of a replica whose tags are drawn."""
-PICTURES: Final[Mapping[str, Picture]] = {
-    "tags": Picture(
-        draw=draw_tags, is_available=lambda curves: curves.has_tags_between, every=10, over=TAGS_EPISODES
-    ),
-    "visits": Picture(draw=draw_visit_maps, is_available=_has_board, is_sampled=True),
-    "turn": Picture(draw=draw_stock, is_available=_has_board, axes=_stock_axes, is_sampled=True),
-    "lorenz": Picture(draw=draw_lorenz, is_available=lambda curves: curves.has_lorenz, axes=_lorenz_axes),
-}
-"""The kinds of pictures of a training by name, which is also the entity of most of them."""
 
 
 class Pictures(View):
@@ -361,66 +312,67 @@ class Pictures(View):
 
     def __init__(self, logger: RerunLogger, samples: Samples | None, *, every: int) -> None:
         self._logger = logger
-        self._every = every
-        self._empty = PictureData(curves=logger.curves, samples=samples)
-        self._pictures = {
-            name: picture for name, picture in PICTURES.items() if picture.is_available(logger.curves)
-        }
         self._episodes: list[Episode] = []
         self._ended = 0
-        self._drawn = dict.fromkeys(self._pictures, 0)
-        """How many episodes all replicas had ended when each picture was drawn last."""
-        self._first: dict[str, PictureData] = {}
-        worlds = logger.curves.worlds
+        self._pictures: list[Picture] = []
+        curves = logger.curves
+        if curves.has_tags_between:
+            self._pictures.append(Picture(draw=draw_tags, every=10, over=TAGS_EPISODES))
+        if samples is not None:
+            self._pictures += [
+                Picture(draw=samples.draw_visit_maps, every=every, is_sampled=True),
+                Picture(draw=samples.draw_stock, every=every, is_sampled=True, axes=samples.axes),
+            ]
+        if curves.has_lorenz:
+            self._pictures.append(Picture(draw=draw_lorenz, every=every, axes=_LORENZ_AXES))
         notice = rr.Points2D.columns(
             positions=[TITLE],
-            labels=[f"lines from episode {ceil(every / worlds) * worlds} on"],
+            labels=[f"lines from episode {ceil(every / curves.worlds) * curves.worlds} on"],
             colors=[TEXT],
             radii=[0.0],
             show_labels=[True],
         )
-        for name, picture in self._pictures.items():
+        for picture in self._pictures:
             if picture.axes is not None:
-                for entity, archetype in picture.axes(self._empty).static_parts().items():
+                for entity, archetype in picture.axes.static_parts().items():
                     logger.log_static(entity, archetype)
-                logger.log_columns(f"{name}/title", ([0], [0], [0]), notice, live_only=True)
+                title = f"{picture.axes.origin}/title"
+                logger.log_columns(title, ([0], [0], [0]), notice, live_only=True)
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode) -> None:
         self._episodes.append(episode)
 
     def on_numbers(self, episode: int, numbers: Numbers) -> None:
         ended_before = self._ended
         self._ended = episode + 1
-        for name, picture in self._pictures.items():
-            every = picture.every or self._every
-            if self._ended // every > ended_before // every:
-                self._draw(name, picture)
-        oldest = min([self._ended - TAGS_EPISODES, *self._drawn.values()])
+        for picture in self._pictures:
+            if self._ended // picture.every > ended_before // picture.every:
+                self._draw(picture)
+        oldest = min([self._ended - TAGS_EPISODES, *(picture.drawn for picture in self._pictures)])
         self._episodes = [past for past in self._episodes if past.episode >= oldest]
 
     def close(self) -> None:
-        for name, picture in self._pictures.items():
-            if self._ended > self._drawn[name]:
-                self._draw(name, picture)
+        for picture in self._pictures:
+            if self._ended > picture.drawn:
+                self._draw(picture)
 
     def resumed(self) -> None:
-        for name, picture in self._pictures.items():
+        for picture in self._pictures:
             if picture.is_sampled:
-                self._drawn[name] = self._ended
+                picture.drawn = self._ended
 
-    def _draw(self, name: str, picture: Picture) -> None:
-        drawn_before = self._drawn[name]
+    def _draw(self, picture: Picture) -> None:
         ended = self._ended
-        begin = ended - picture.over if picture.over else drawn_before
+        begin = ended - picture.over if picture.over else picture.drawn
         episodes = [episode for episode in self._episodes if begin <= episode.episode < ended]
-        span = f"episodes {drawn_before + 1} to {ended}"
-        if ended == drawn_before + 1:
+        span = f"episodes {picture.drawn + 1} to {ended}"
+        if ended == picture.drawn + 1:
             span = f"episode {ended}"
-        data = replace(self._empty, episodes=episodes, span=span, first=self._first.get(name))
-        self._drawn[name] = ended
+        data = PictureData(episodes, span, picture.first)
+        picture.drawn = ended
         archetypes = picture.draw(data)
         if archetypes:
-            self._first.setdefault(name, data)
+            picture.first = picture.first or data
         for entity, archetype in archetypes.items():
             self._logger.log_row(entity, archetype)
 
@@ -438,8 +390,7 @@ def borders(regions: OwnedRegions) -> Any:
     for owners, cells in regions:
         sides = _borders(cells)
         strips += sides
-        hue = agent_colour(owners[0]) if len(owners) == 1 else GREY
-        colours += [(*hue, _BORDER_OPACITY)] * len(sides)
+        colours += [(*region_colour(owners), _BORDER_OPACITY)] * len(sides)
     return rr.LineStrips2D(strips, colors=colours, radii=_BORDER_RADIUS_CELLS, draw_order=-4.0)
 
 

@@ -1,6 +1,6 @@
 """The parts of a replay's recording beside the board: action values, violations and payments in each turn."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from typing import Any, Final
 
@@ -22,7 +22,6 @@ from cprl.viewer.board import centres_of
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import BOARD_BACKGROUND, GIVEN, PAID
 from cprl.viewer.scene import BAR_GAP, BAR_HIGH, BAR_WIDE, Scene, decision_panels
-from cprl.viewer.view import Learning
 
 _DECISIONS: Final = "decisions"
 """The entity of the bars of action values."""
@@ -91,7 +90,7 @@ class Decisions:
         self._images.append(image)
         self._texts += texts
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         count = len(self._images)
         if not count:
             return
@@ -206,7 +205,7 @@ class ViolationMarks:
         # The viewer shows a label when the mouse is on its diamond.
         self._labels.append([describe_violation(agent, fines[agent]) for agent in violators.tolist()])
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         frames = len(self._diamonds)
         if not frames:
             return

@@ -1,6 +1,6 @@
 """The contents of a recording: its numbers, its board, and the positions of boards in joint images."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from math import ceil
 from typing import Any, Final
@@ -90,16 +90,16 @@ class Curves:
         return "apples" if COLLECTIVE_RETURN in self.metrics else "return"
 
     @property
-    def bold(self) -> str:
-        """Return the words that explain the bold line of a plot."""
-        return f"bold: mean of {self.mean_over} episodes"
+    def mean(self) -> str:
+        """Return the name of the bold line of a plot."""
+        return f"mean of {self.mean_over} episodes"
 
     @property
     def legend(self) -> str:
         """Return the words that explain the lines of all plots."""
         point = "" if self.worlds == 1 else f"a point is the mean of {self.worlds} episodes; "
         thin = "thin: a replica, " if self.replicas > 1 else ""
-        return f"Curves by episode: {point}{thin}{self.bold}, grey: random play"
+        return f"Curves by episode: {point}{thin}bold: {self.mean}, grey: random play"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,7 +197,7 @@ def _caption(game: Game) -> str:
     return f"{caption}; others red"
 
 
-_NEEDED_ENTRIES: Final[Mapping[str, tuple[str, ...]]] = {
+_NEEDED_ENTRIES: Final = {
     "new bests": ("harvest",),
     "who tagged whom": ("tagged_by",),
     "the Lorenz curve": ("harvest",),

@@ -6,8 +6,7 @@ The module also holds the two views of lines over episodes: `Plots` and `JointAc
 from collections.abc import Callable, Mapping, Sequence
 from math import isnan, nan
 from statistics import fmean
-from threading import Event
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
@@ -16,7 +15,6 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.envs.commons_env import CommonsEnv
-from cprl.measuring.playing import Policy
 from cprl.measuring.registry import AGENT_TOTALS, INCOME
 from cprl.measuring.series import ENV_STEPS, GROUP_PREFIXES, Recent, mean_of
 from cprl.measuring.tracker import Episode
@@ -25,8 +23,6 @@ from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import JOINT, RANDOM_PLAY_FOLDER
 from cprl.viewer.scene import Scene
 
-Learning = Mapping[str, float]
-"""The numbers of learning of an episode, by their names."""
 Numbers = Mapping[str, Float64]
 """All numbers of an episode, float64 [R] each, by their names."""
 
@@ -48,7 +44,7 @@ class View:
     def on_board(self, env: CommonsEnv, scene: Scene) -> None:
         """Show the worlds of another game from now on, if the view shows worlds."""
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode) -> None:
         """Add an episode of one world."""
 
     def on_numbers(self, episode: int, numbers: Numbers) -> None:
@@ -66,17 +62,10 @@ class View:
     def close(self) -> None:
         """Log the remaining data; a second call does nothing."""
 
-    def watch_random_play(self, env: EnvBase, policy: Policy) -> Policy:
-        """Return the policy of random play before the training, wrapped if the view watches it."""
-        return policy
 
-    def play_on(self, stop: Event) -> None:
-        """Play the trained policy for viewers until the event is set; by default nothing is played."""
-
-
-Exhibit = Callable[[EnvBase, RerunLogger], View]
+Exhibit = Callable[[EnvBase, RerunLogger], Any]
 """A function that makes the view in which the current policy plays for live viewers, from the training's
-environment and its logger."""
+environment and its logger; see `cprl.experimental.exhibition`."""
 
 
 def has_died(episode: Episode) -> bool | None:
@@ -156,7 +145,7 @@ class JointActions(View):
         action = batch[keys.ACTION].cpu().numpy()
         self._counts[self._worlds, action @ self._digit_values] += 1
 
-    def on_episode(self, episode: Episode, learning: Learning) -> None:
+    def on_episode(self, episode: Episode) -> None:
         counts = self._counts[episode.world]
         if counts.any():
             block = episode.episode // self._logger.curves.worlds

@@ -1,6 +1,5 @@
 """The page of five steps about a field of apples: scripted agents play in it, without a server."""
 
-import json
 from dataclasses import replace
 from typing import Any, Final
 
@@ -8,7 +7,7 @@ from cprl.commons.game import Game
 from cprl.commons.published import game as published_game
 from cprl.institutions import Quota
 from cprl.web.playable import playable
-from cprl.web.scenes import scene_json
+from cprl.web.scenes import compact_json, scene_json
 from cprl.web.static_pages import page_of
 
 GROWTHS: Final = (0.25, 0.5, 1, 2, 4)
@@ -39,7 +38,7 @@ def parts() -> dict[str, str]:
         "learners": LEARNERS,
         "random": RANDOM_PLAY,
     }
-    return {"title": "A field of apples", "more": "", "data": json.dumps(data, separators=(",", ":"))}
+    return {"title": "A field of apples", "more": "", "data": compact_json(data)}
 
 
 def grown(game: Game, times: float) -> Game:

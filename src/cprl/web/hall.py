@@ -16,13 +16,12 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
-from datetime import datetime
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from cprl.runs.files import LOCK_FILE, RunLock, read_json, refuse_newer, write_json
+from cprl.runs.files import LOCK_FILE, RunLock, read_json, refuse_newer, time_now, write_json
 from cprl.runs.recipe import versions
 from cprl.system.output import say
 from cprl.web import messages
@@ -192,9 +191,8 @@ class Hall:
         self._practice: list[HostedRound] = []
         if session.practice_turns:
             name, game = games[0]
-            self._practice = [
-                HostedRound(session, 0, name, with_turns(game, session.practice_turns), runs=runs)
-            ]
+            game = with_turns(game, session.practice_turns)
+            self._practice.append(HostedRound(session, 0, name, game, runs=runs, folder=None))
         self.stage = "lobby"
         self._until: float | None = None
         self._round: HostedRound | None = None
@@ -206,7 +204,7 @@ class Hall:
         with ExitStack() as opening:
             folder.mkdir(parents=True, exist_ok=True)
             opening.enter_context(RunLock(folder))
-            self.token, self._table, self.seats = self._opened()
+            self._open()
             self._save()
             self._closing = opening.pop_all()
 
@@ -218,26 +216,29 @@ class Hall:
 
     # the folder
 
-    def _opened(self) -> tuple[str, dict[str, Any], list[Seat]]:
-        """Return the token, the table and the seats of the session in the folder, which may be a new one."""
+    def _open(self) -> None:
+        """Read the session in the folder, or begin it in a new one."""
         path = self.folder / SESSION_FILE
+        link = self.folder / LINK_FILE
         consent = self.session.consent
         config = {**self.session.to_config(), "consent": consent and digest(consent)}
         if path.exists():
-            table = read_json(path)
-            refuse_newer(path, table, SESSION_FORMAT)
-            if table.get("session") != json.loads(json.dumps(config)):
+            self._table = read_json(path)
+            refuse_newer(path, self._table, SESSION_FORMAT)
+            if self._table.get("session") != json.loads(json.dumps(config)):
                 raise ValueError(
                     f"{path} is of another session; allowed: what it was begun with, or another folder"
                 )
-            seats = [self._make_seat(**seat) for seat in table["seats"]]
-            return (self.folder / LINK_FILE).read_text(encoding="ascii"), table, seats
-        if {file.name for file in self.folder.iterdir()} - {LOCK_FILE}:
+            self.token = link.read_text(encoding="ascii")
+            self.seats = [self._make_seat(**seat) for seat in self._table["seats"]]
+            return
+        if {file.name for file in self.folder.iterdir()} - {LOCK_FILE, LINK_FILE}:
             raise FileExistsError(f"{self.folder} is not empty; allowed: a new folder, or that of a session")
-        token = secrets.token_urlsafe(16)
-        (self.folder / LINK_FILE).touch(mode=0o600)
-        (self.folder / LINK_FILE).write_text(token, encoding="ascii")
-        table = {
+        self.token = secrets.token_urlsafe(16)
+        link.unlink(missing_ok=True)
+        link.touch(mode=0o600)
+        link.write_text(self.token, encoding="ascii")
+        self._table = {
             "format": SESSION_FORMAT,
             "id": secrets.token_hex(8),
             "begun": time_now(),
@@ -246,7 +247,7 @@ class Hall:
             "rounds": {f"round-{part.number + 1}": part.name for part in self.rounds},
         }
         places = np.ndindex(self.session.groups, self.session.people)
-        return token, table, [self._make_seat(group=group, agent=agent) for group, agent in places]
+        self.seats = [self._make_seat(group=group, agent=agent) for group, agent in places]
 
     def _make_seat(self, **fields: Any) -> Seat:
         return Seat(**fields, budget=Budget(self._rate, 2 * self._rate))
@@ -278,14 +279,14 @@ class Hall:
         seat = self.seat_of(seat_token or "")
         if seat is not None and seat_token is not None:
             return {"seat_token": seat_token, "code": seat.code}
-        free = [seat for seat in self.seats if self._is_free(seat)]
-        if not free:
+        free = next((seat for seat in self.seats if self._is_free(seat)), None)
+        if free is None:
             raise JoinRefusedError(409, f"all {len(self.seats)} seats are taken")
         secret = secrets.token_urlsafe(16)
         taken = {seat.code for seat in self.seats}
-        self.seats[self.seats.index(free[0])] = seat = self._make_seat(
-            group=free[0].group,
-            agent=free[0].agent,
+        self.seats[self.seats.index(free)] = seat = self._make_seat(
+            group=free.group,
+            agent=free.agent,
             code=next(code for code in iter(_code, "") if code not in taken),
             secret=digest(secret),
             consented="" if self.session.consent else time_now(),
@@ -371,17 +372,16 @@ class Hall:
                 if not this.has_chat:
                     raise ValueError("there is no chat in this session")
                 this.keep_chat(seat.group, seat.agent, text, _ms())
-                for other in self._group_of(seat):
-                    other.send("chat", **{"from": self.session.names()[seat.agent], "text": text})
+                line = {"from": self.session.names()[seat.agent], "text": text}
+                for other in self.seats:
+                    if other.group == seat.group and other.consented:
+                        other.send("chat", **line)
 
     def _round_now(self, what: str, is_now: bool = True) -> HostedRound:
         """Return the round that is on; raise a ValueError if it is too early or too late."""
         if self._round is None or not is_now:
             raise ValueError(f"there is no {what} now")
         return self._round
-
-    def _group_of(self, seat: Seat) -> list[Seat]:
-        return [other for other in self.seats if other.group == seat.group and other.consented]
 
     # what people are told
 
@@ -402,7 +402,7 @@ class Hall:
     @property
     def _number(self) -> int:
         """Return the number of the round, from 1; 0 before the first, and in practice."""
-        return 0 if self._round is None or self._round in self._practice else self._round.number + 1
+        return 0 if self._round is None or self._round.folder is None else self._round.number + 1
 
     def _catch_up(self, seat: Seat) -> None:
         """Send a person what is on: the stage, and the round with its board, or the end."""
@@ -490,10 +490,10 @@ class Hall:
         if this.turn:
             await self._stay("paused", self._are_back, _BACK_WITHIN_SECONDS)
         else:
-            is_first = this is [*self._practice, *self.rounds][0]
+            is_first = this is (self._practice or self.rounds)[0]
             stage = "instructions" if is_first else "between"
             await self._stay(stage, self._are_ready, self.session.pause_seconds)
-        await self._stay("practice" if this in self._practice else "playing")
+        await self._stay("practice" if this.folder is None else "playing")
         self._send_turns(this)
         gc.collect()
         gc.freeze()  # a full collection would stop the clock for a quarter of a second
@@ -540,17 +540,16 @@ class Hall:
         """Play a turn of all groups, keep it, and send it."""
         action = this.nothing()
         votes = this.nothing()
-        person = action != NONE
+        person = np.zeros(action.shape, np.bool_)
+        given = np.zeros(action.shape, np.bool_)
         stay = this.game.actions.index(STAY)
         for seat in self.seats:
             agent = seat.group, seat.agent
             person[agent] = bool(seat.consented) and not seat.has_left_for(_ABSENT_AFTER_SECONDS)
+            given[agent] = seat.action != NONE
             stays = person[agent] or self.session.absent == STAY
-            action[agent] = stay if stays and seat.action == NONE else seat.action
+            action[agent] = stay if stays and not given[agent] else seat.action
             votes[agent] = seat.vote
-        given = np.zeros_like(person)
-        for seat in self.seats:
-            given[seat.group, seat.agent] = seat.action != NONE
             seat.action = NONE
         playing = [group for group in range(self.session.groups) if group not in this.episodes]
         this.play(action, votes)
@@ -571,11 +570,6 @@ class Hall:
 def digest(secret: str) -> str:
     """Return the SHA-256 of a secret, the only form in which the session keeps it."""
     return hashlib.sha256(secret.encode(errors="replace")).hexdigest()
-
-
-def time_now() -> str:
-    """Return the time, as texts of the session hold it."""
-    return datetime.now().astimezone().isoformat(timespec="seconds")
 
 
 def _ms() -> int:

@@ -10,9 +10,10 @@ from typing import Final
 from aiohttp import WSMsgType
 
 from cprl.system.output import say
+from cprl.values import build
 from cprl.web import messages
-from cprl.web.hall import Close, Hall, JoinRefusedError, Outbox, Seat
-from cprl.web.serving import address_in_room, body_of, guarded, lasts, names_of, serving, web
+from cprl.web.hall import Hall, JoinRefusedError, Outbox, Seat
+from cprl.web.serving import address_in_room, body_of, lasts, page_route, serving, web
 from cprl.web.static_pages import page_of
 
 _SEND_SECONDS: Final = 10.0
@@ -23,22 +24,13 @@ _MOST_FRAME_BYTES: Final = 4 * messages.MOST_BYTES
 _PROTOCOL: Final = "cprl"
 
 
-def application(hall: Hall, hosts: set[str]) -> web.Application:
-    """Return the application of a hosted game.
-
-    Args:
-        hall: the session.
-        hosts: what browsers may call the server, see `cprl.web.serving.names_of`.
-    """
+def routes_of(hall: Hall) -> list[web.RouteDef]:
+    """Return the page of a hosted game, the way to a seat, and the sockets."""
     page = page_of("host.html", "host.css", "board.js", "host.js", title=escape(hall.session.title))
-    policy = {"Content-Security-Policy": "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"}
-
-    async def show_page(request: web.Request) -> web.StreamResponse:
-        return web.Response(text=page, content_type="text/html", headers=policy)
 
     async def join(request: web.Request) -> web.StreamResponse:
         try:
-            body = messages.Join.read(await body_of(request))
+            body = build(messages.Join, messages.read_object(await body_of(request)), "join")
             return web.json_response(hall.join(body.token, body.seat_token))
         except ValueError as error:
             return _refused(400, str(error))
@@ -52,7 +44,7 @@ def application(hall: Hall, hosts: set[str]) -> web.Application:
             return _refused(403, "this seat is not of this session")
         return await _talk(request, hall, seat)
 
-    return guarded([web.get("/", show_page), web.post("/join", join), web.get("/socket", socket)], hosts)
+    return [page_route(page), web.post("/join", join), web.get("/socket", socket)]
 
 
 def _refused(status: int, why: str) -> web.Response:
@@ -87,12 +79,8 @@ async def _talk(request: web.Request, hall: Hall, seat: Seat) -> web.WebSocketRe
 async def _send(ws: web.WebSocketResponse, outbox: Outbox) -> None:
     """Send what waits for a seat; close the socket when it is to be closed, or too slow."""
     with suppress(ConnectionError, TimeoutError):
-        while True:
-            async with asyncio.timeout(None) as limit:
-                news = await outbox.get()
-                limit.reschedule(asyncio.get_running_loop().time() + _SEND_SECONDS)
-                if isinstance(news, Close):
-                    break
+        while isinstance(news := await outbox.get(), str):
+            async with asyncio.timeout(_SEND_SECONDS):
                 await ws.send_str(news)
         await ws.close(code=news.code, message=news.why.encode())
         return
@@ -108,11 +96,8 @@ async def serve_session(hall: Hall, *, port: int, in_room: bool = False) -> None
         in_room: whether other machines of the local network may join.
     """
     address = address_in_room() if in_room else "127.0.0.1"
-    hosts: set[str] = set()
-    app = application(hall, hosts)
-    async with serving(app, list({address: 0, "127.0.0.1": 0}), port) as places:
-        for place in places:
-            hosts |= names_of(*place)
+    addresses = list(dict.fromkeys((address, "127.0.0.1")))
+    async with serving(routes_of(hall), addresses, port) as places:
         _announce(f"http://{places[0][0]}:{places[0][1]}/#{hall.token}", hall, in_room=in_room)
         with suppress(NotImplementedError, ValueError, OSError):  # no terminal, or Windows
             if sys.stdin.isatty():

@@ -20,25 +20,25 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl import keys
 from cprl.commons.game import Game
-from cprl.commons.world import WorldView
 from cprl.envs.commons_env import CommonsEnv
 from cprl.evaluation.fresh import averages_of
 from cprl.experiment import Experiment
-from cprl.measuring.playing import evaluate
+from cprl.measuring.registry import COLLECTIVE_RETURN
+from cprl.measuring.statistics import estimate_if_finite
 from cprl.measuring.tracker import Episode, tracker_of
-from cprl.pictures.decoding import classes_seen
-from cprl.population import AgentSpec, Person, Scripted, has_people, partners_in
+from cprl.pictures.decoding import classes_seen, window_text
+from cprl.pictures.readable import instructions_of, options_of
+from cprl.population import AgentSpec, Person, has_people, partners_in
 from cprl.runs.episodes import append_batch, batches_in, stored_episodes
 from cprl.runs.files import REPORT, write_atomically
 from cprl.runs.played import write_played
 from cprl.runs.states import start
 from cprl.training.agents import Population
 from cprl.training.stored import LoadedRun
-from cprl.values.array_types import Bool, Int64, UInt8
+from cprl.values.array_types import Bool, Int64
 from cprl.web.hosting import TRAINED
-from cprl.web.messages import SIGNS
 from cprl.web.scenes import moment_json, scene_json, window_colours
-from cprl.web.session import HostedSession, instructions_of, options_of
+from cprl.web.session import HostedSession
 
 NONE: Final = -1
 """What stands for no action, or no vote: a script, or chance, decides."""
@@ -85,13 +85,10 @@ class Journal:
     def __init__(self, path: Path, schema: pa.Schema) -> None:
         self.path = path
         self.schema = schema
-        self.batches: list[pa.RecordBatch] = []
-        end = 0
-        if path.exists():
-            whole = list(batches_in(path))
-            self.batches = [batch for batch, _ in whole]
-            end = whole[-1][1] if whole else 0
-        self._file = FileIO(path, "r+" if path.exists() else "x")
+        whole = list(batches_in(path)) if path.exists() else []
+        self.batches = [batch for batch, _ in whole]
+        end = whole[-1][1] if whole else 0
+        self._file = FileIO(path, "a")
         self._file.truncate(end)
         self._file.seek(end)
 
@@ -133,8 +130,8 @@ class HostedRound:
         name: str,
         game: Game,
         *,
-        runs: Sequence[LoadedRun] = (),
-        folder: Path | None = None,
+        runs: Sequence[LoadedRun],
+        folder: Path | None,
     ) -> None:
         self.session = session
         self.number = number
@@ -147,11 +144,6 @@ class HostedRound:
         self.episodes: dict[int, Episode] = {}
         """The episode of each group that has ended."""
         self._find_agents()
-        greedy = [Scripted("greedy")] * game.agents
-        env = CommonsEnv(game, seed=self.seed)
-        (episode,) = evaluate(env, Population(env, greedy, seed=self.seed).policy(1))
-        self.greedy_turns = episode.steps if episode.terminated else None
-        """The turns after which the board is empty if all are greedy; None if it is not."""
         self.play(self.nothing(), self.nothing())
         self.views()
         self._set_up()
@@ -177,8 +169,8 @@ class HostedRound:
         self._policy = Population(self._env, self._specs, seed=self.seed).policy(1)
         self._tracker = tracker_of(self._env)
         self._moment = self._env.reset()
-        self._violated = self.nothing() != NONE
-        self._income = np.zeros(self._violated.shape)
+        self._income = np.zeros((self.session.groups, self.game.agents))
+        self._violated = np.zeros(self._income.shape, np.bool_)
         self.turn = 0
         self.episodes.clear()
 
@@ -349,18 +341,15 @@ class HostedRound:
 
     def views(self) -> list[dict[str, Any]]:
         """Return the parts of the message "turn" that the people of each group share."""
-        boards = self._env.worlds.boards(self._env.output)
-        now = self._env.worlds.now
         views = []
-        for group, board in enumerate(boards):
-            arrays = {name: getattr(now, name)[group] for name in WorldView._fields[2:]}
-            world = WorldView(self._observation()[group], board, **arrays)
+        for group in range(self.session.groups):
+            world = self._env.worlds.show(self._env.output, world=group)
             views.append(
                 {
                     "turn": self.turn,
                     "harvest": world.harvested.tolist(),
                     "income": self._income[group].round(2).tolist() if self.game.institutions else None,
-                    "stock": int(now.stock_left[group, 0]),
+                    "stock": int(world.stock.sum()),
                     "rule_in_force": "; ".join(self.in_force(group)) or None,
                     "board": moment_json(self.game.map, world, self._violated[group]),
                 }
@@ -380,20 +369,15 @@ class HostedRound:
         in_play[[*self.episodes]] = False
         return in_play
 
-    def _observation(self) -> UInt8:
-        observation: UInt8 = self._moment[keys.OBSERVATION].numpy()
-        return observation
-
     def seen(self, group: int, agent: int, view: str) -> dict[str, str]:
         """Return what an agent observes, in the form that its seat asks for: "window", "array" or "text"."""
-        observation = self._observation()[group, agent]
+        observation = self._moment[keys.OBSERVATION].numpy()[group, agent]
         if view == "array":
             return {"observation": b64encode(observation.tobytes()).decode()}
+        if view == "text":
+            return {"text": window_text(self.game, observation)}
         classes = classes_seen(self.game, observation[None, None])[0, 0]
-        if view == "window":
-            return {"window": b64encode(classes.tobytes()).decode()}
-        signs = np.vectorize(lambda kind: SIGNS.get(kind, "O"))(classes)
-        return {"text": "\n".join(map("".join, signs))}
+        return {"window": b64encode(classes.tobytes()).decode()}
 
     def result(self, group: int) -> dict[str, Any]:
         """Return how the round ended for a group, as messages say it."""
@@ -406,12 +390,19 @@ class HostedRound:
             "ended": "no apple was left" if episode.terminated else "time was up",
         }
 
-    def trained(self) -> dict[str, float] | None:
-        """Return the average harvest of an agent, and the turns, of trained agents that played this very
-        game; None without them."""
+    def trained(self) -> dict[str, Any] | None:
+        """Return the harvest of an agent, and the turns, of trained agents that played this very game.
+
+        They are means over replicas; of several replicas also their intervals. None without such agents.
+        """
         runs = [run for run in self._runs if run.game == self.game and not has_people(run.specs)]
         averages = averages_of(runs[0]) if runs else {}
         if not averages:
             return None
-        turns, apples = np.median([*averages.values()], axis=0).tolist()
-        return {"harvest": apples / self.game.agents, "survival_steps": turns}
+        turns, apples = np.transpose([*averages.values()])
+        trained: dict[str, Any] = {}
+        for name, values in (("harvest", apples / self.game.agents), ("survival_steps", turns)):
+            mean = estimate_if_finite(values.tolist()).of(COLLECTIVE_RETURN)
+            trained[name] = mean.value
+            trained[f"{name}_interval"] = mean.interval if len(values) > 1 else None
+        return trained

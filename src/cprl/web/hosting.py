@@ -9,7 +9,11 @@ from cprl.values import Natural, Positive, Range, Seed, Value, Where
 STAY: Final = "stay"
 TRAINED: Final = "trained"
 ShortText = Annotated[
-    str, Where(lambda text: 0 < len(text) <= 200 and text.isprintable(), "1 to 200 printable characters")
+    str,
+    Where(
+        lambda text: bool(text.strip()) and len(text) <= 200 and text.isprintable(),
+        "1 to 200 printable characters",
+    ),
 ]
 
 
@@ -21,10 +25,10 @@ class Hosting(Value, stored=False, called="session"):
     """People in each group, who are its first agents."""
     groups: Annotated[int, Range(1, 100)] = 1
     """Groups that play side by side, each in a world of its own."""
-    agents: tuple[ShortText, ...] = ()
+    agents: tuple[str, ...] = ()
     """The other agents of each group, a word each: trained, greedy, sustainable, random, territorial,
     aggressive or pacifist."""
-    runs: tuple[ShortText, ...] = ()
+    runs: tuple[str, ...] = ()
     """Directories of runs whose agents may play as "trained", beside the run that is the game: in each round
     those of the first run whose agents can play it."""
     turns: Positive | None = None
@@ -41,7 +45,7 @@ class Hosting(Value, stored=False, called="session"):
     """What people see: the whole board, or what an agent in their place observes."""
     chat: bool = False
     """Whether people may write to their group; they also may in a game with signals."""
-    absent: ShortText = STAY
+    absent: str = STAY
     """What the agent of a person who has left does: stay, or one of the scripted policies."""
     title: ShortText = "A commons"
     """The title of the page."""

@@ -41,63 +41,47 @@ From the server come:
                               rule), beams
                  window       base64 of the classes of the cells that one sees, a byte a cell, row by row
                  observation  base64 of ("agents", "observation") of `CommonsEnv`, uint8 of observation_shape
-                 text         the window as lines of `SIGNS`
+                 text         the window as lines of `cprl.pictures.decoding.SIGNS`
     chat       from, text
     vote       result: the title and the value in force of each ballot
     round_end  round, harvest, income, survival_steps, ended (in words)
     end        completion_code, names, rounds: of each rule, harvest, income, survival_steps, ended, and
-               trained (harvest of an agent and survival_steps on average, or null)
+               trained (harvest of an agent and survival_steps, means over replicas, and harvest_interval and
+               survival_steps_interval, [low, high] or null for a single replica; or null)
     error      why: the message was no JSON, too large, unknown, too early or not allowed; nothing has changed
 """
 
 import json
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal, Self, TypeAlias
+from typing import Any, Final, Literal, TypeAlias
 
-from cprl.commons.cells import APPLE, BEAM, CLEANING, GROUND, OTHER, SELF, WALL, WASTE, WATER
-from cprl.values import Natural, Value, Where, build, short_repr
+from cprl.values import Natural, Value, build, short_repr
+from cprl.web.hosting import ShortText
 
 MOST_BYTES: Final = 1024
 """The largest message that is read."""
-SIGNS: Final = {
-    GROUND: ".",
-    WALL: "#",
-    APPLE: "A",
-    BEAM: "*",
-    OTHER: "O",
-    SELF: "@",
-    WATER: "~",
-    WASTE: "H",
-    CLEANING: "*",
-}
-"""The sign of each class of cells in a window as text; other agents that can be told apart are `O` too."""
 
 
 @dataclass(frozen=True)
-class Join(Value, stored=False, called="join"):
+class Join(Value, stored=False):
     """What one posts to get a seat, or to ask for the one that one has."""
 
     token: str
     seat_token: str | None = None
 
-    @classmethod
-    def read(cls, text: object) -> Self:
-        """Read the body of a request; raise a ValueError for any other text."""
-        return build(cls, read_object(text), "join")
-
 
 @dataclass(frozen=True)
-class Consent(Value, stored=False, called="consent"):
+class Consent(Value, stored=False):
     """A person consents to the text that was shown."""
 
 
 @dataclass(frozen=True)
-class Ready(Value, stored=False, called="ready"):
+class Ready(Value, stored=False):
     """A person has read what is shown."""
 
 
 @dataclass(frozen=True)
-class Action(Value, stored=False, called="action"):
+class Action(Value, stored=False):
     """The action for the coming turn, by its name, and the number that comes back with it."""
 
     action: str
@@ -105,27 +89,21 @@ class Action(Value, stored=False, called="action"):
 
 
 @dataclass(frozen=True)
-class Choice(Value, stored=False, called="vote"):
+class Choice(Value, stored=False):
     """The choice on the ballots of the coming round, as an index into its options."""
 
     option: Natural
 
 
 @dataclass(frozen=True)
-class Chat(Value, stored=False, called="chat"):
+class Chat(Value, stored=False):
     """A line to one's group."""
 
-    text: Annotated[
-        str,
-        Where(
-            lambda text: bool(text.strip()) and len(text) <= 200 and text.isprintable(),
-            "1 to 200 printable characters",
-        ),
-    ]
+    text: ShortText
 
 
 @dataclass(frozen=True)
-class Seeing(Value, stored=False, called="view"):
+class Seeing(Value, stored=False):
     """The form of one's turns from now on."""
 
     view: Literal["array", "text"]

@@ -29,7 +29,7 @@ from cprl.web.explorable import SCRIPTS, grown, parts
 from cprl.web.messages import read_object
 from cprl.web.playable import playable
 from cprl.web.scenes import scene_json
-from cprl.web.serving import body_of, guarded, names_of, serving, web
+from cprl.web.serving import body_of, page_route, serving, web
 from cprl.web.show import data_of
 from cprl.web.static_pages import page_of, static_text
 
@@ -145,7 +145,7 @@ class Sandbox:
 
     def __init__(self, folder: Path | None = None, *, episodes: int = SANDBOX_EPISODES) -> None:
         self._temporary = TemporaryDirectory()
-        self.folder = Path(self._temporary.name) if folder is None else folder
+        self.folder = folder or Path(self._temporary.name)
         self.episodes = checked("episodes", episodes, Positive)
         self._changing = Lock()
         """Guards the training."""
@@ -161,13 +161,8 @@ class Sandbox:
                 process.wait()
         self._temporary.cleanup()
 
-    def application(self, hosts: set[str]) -> web.Application:
-        """Return the application; `hosts` as in `cprl.web.serving.guarded`."""
-        page = sandbox_page()
-        policy = {"Content-Security-Policy": "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"}
-
-        async def show_page(request: web.Request) -> web.StreamResponse:
-            return web.Response(text=page, content_type="text/html", headers=policy)
+    def routes(self) -> list[web.RouteDef]:
+        """Return the page, and what it asks for."""
 
         def answering(answer: Callable[[str], Any]) -> Any:
             """Return a handler that answers in JSON, and a ValueError in words."""
@@ -181,15 +176,14 @@ class Sandbox:
 
             return handler
 
-        routes = [
-            web.get("/", show_page),
+        return [
+            page_route(sandbox_page()),
             web.post("/game", answering(lambda body: Sliders.read(body).trial())),
             web.post("/recipe", answering(lambda body: Sliders.read(body).recipe(self.episodes))),
             web.post("/train", answering(lambda body: self.train(Sliders.read(body)))),
             web.post("/state", answering(lambda _: self.state())),
             web.post("/trained", answering(lambda _: self.trained())),
         ]
-        return guarded(routes, hosts)
 
     def train(self, sliders: Sliders) -> dict[str, Any]:
         """Begin to train, and return the state; raise a ValueError while a training runs."""
@@ -261,8 +255,6 @@ async def serve_sandbox(sandbox: Sandbox, port: int, announce: Callable[[str], N
         port: of the page; 0 for any that is free.
         announce: called with its address.
     """
-    hosts: set[str] = set()
-    async with serving(sandbox.application(hosts), ["127.0.0.1"], port) as [place]:
-        hosts |= names_of(*place)
+    async with serving(sandbox.routes(), ["127.0.0.1"], port) as [place]:
         announce(f"http://{place[0]}:{place[1]}/")
         await asyncio.Event().wait()

@@ -14,7 +14,7 @@ from cprl.commons.game import Game
 from cprl.commons.maps import Map
 from cprl.commons.world import WorldView
 from cprl.pictures.colours import GREY, PALETTE, agent_colour, agent_mark, picture_colour
-from cprl.pictures.image import EMPTY_SITE_COLOUR, regions_of
+from cprl.pictures.image import EMPTY_SITE_COLOUR, region_colour, regions_of
 from cprl.values.array_types import Bool
 
 _COLOURS: Final = {
@@ -44,10 +44,7 @@ def scene_json(game: Game) -> dict[str, Any]:
         "river": _indices(board, board.river),
         "sites": _indices(board, board.sites),
         "regions": [
-            {
-                "colour": agent_colour(owners[0]) if len(owners) == 1 else GREY,
-                "cells": np.flatnonzero(inside).tolist(),
-            }
+            {"colour": region_colour(owners), "cells": np.flatnonzero(inside).tolist()}
             for owners, inside in regions_of(game)
         ],
         "colours": [agent_colour(agent) for agent in agents],

@@ -13,7 +13,7 @@ import socket
 import sys
 import traceback
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, closing
 from typing import Final
 
 try:
@@ -43,19 +43,24 @@ _STATES: Final[dict[asyncio.BaseProtocol, int]] = {}
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 
-def names_of(address: str, port: int) -> set[str]:
+def page_route(page: str) -> web.RouteDef:
+    """Return the route of a page that says itself what it may load."""
+    policy = {"Content-Security-Policy": "frame-ancestors 'none'; base-uri 'none'; form-action 'none'"}
+
+    async def show(request: web.Request) -> web.StreamResponse:
+        return web.Response(text=page, content_type="text/html", headers=policy)
+
+    return web.get("/", show)
+
+
+def _names_of(address: str, port: int) -> set[str]:
     """Return what a browser may call a server at an address in the header `Host`."""
     names = {address, "localhost"} if address == "127.0.0.1" else {address, socket.gethostname().lower()}
     return {f"{name}:{port}" for name in names}
 
 
-def guarded(routes: Sequence[web.RouteDef], hosts: set[str]) -> web.Application:
-    """Return an application that answers requests to these hosts, from their own pages, alone.
-
-    Args:
-        routes: the routes; a body has at most 4,096 bytes.
-        hosts: names with ports, see `names_of`; it may be filled until the first request.
-    """
+def _guarded(routes: Sequence[web.RouteDef], hosts: set[str]) -> web.Application:
+    """Return an application that answers requests to these hosts, from their own pages, alone."""
 
     @web.middleware
     async def guard(request: web.Request, handler: Handler) -> web.StreamResponse:
@@ -115,13 +120,20 @@ def _note(request: web.Request, state: int) -> None:
 
 @asynccontextmanager
 async def serving(
-    app: web.Application, addresses: Sequence[str], port: int
+    routes: Sequence[web.RouteDef], addresses: Sequence[str], port: int
 ) -> AsyncIterator[list[tuple[str, int]]]:
-    """Serve an application in the block, at the port of each address; yield addresses and ports.
+    """Serve routes in the block, at the port of each address; yield addresses and ports.
 
     Nothing is logged: the messages of aiohttp name the addresses of people.
+
+    Args:
+        routes: the routes; the body of a request has at most 4,096 bytes.
+        addresses: the addresses of this machine at which it is served.
+        port: the port; 0 for any that is free.
     """
     logging.getLogger("aiohttp").setLevel(logging.CRITICAL + 1)
+    hosts: set[str] = set()
+    app = _guarded(routes, hosts)
     runner = web.AppRunner(app, access_log=None, shutdown_timeout=1.0, lingering_time=1.0)
     await runner.setup()
     assert runner.server is not None
@@ -138,11 +150,11 @@ async def serving(
         return protocol
 
     try:
-        server = await loop.create_server(watched, list(addresses), port)
-        try:
-            yield [listening.getsockname()[:2] for listening in server.sockets]
-        finally:
-            server.close()
+        with closing(await loop.create_server(watched, addresses, port)) as server:
+            places = [listening.getsockname()[:2] for listening in server.sockets]
+            for place in places:
+                hosts |= _names_of(*place)
+            yield places
     finally:
         await runner.cleanup()
 

@@ -2,19 +2,17 @@
 
 import os
 from dataclasses import dataclass, field, replace
-from itertools import product
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.evaluation.fresh import typical_replica
 from cprl.evaluation.play import board_named
 from cprl.institutions import Institution
-from cprl.pictures.readable import capitalised, growth_of, meaning_of, tag_of
-from cprl.policies.scripted import SCRIPTED_POLICIES
+from cprl.policies.scripted import ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, Scripted
 from cprl.training.stored import LoadedRun, load
-from cprl.values import refusal
+from cprl.values import checked, refusal
 from cprl.web.hosting import STAY, TRAINED, Hosting, ShortText
 
 Treatment: TypeAlias = Game | tuple[Institution, ...]
@@ -25,7 +23,7 @@ Treatment: TypeAlias = Game | tuple[Institution, ...]
 class HostedSession(Hosting, stored=False, called="session"):
     """A game that people play in groups, in one round or several, under treatments in an order."""
 
-    game: Game | ShortText
+    game: Game | str
     """The game; or the name of a published board, the directory of a run, or a file with a drawing."""
     rounds: tuple[tuple[ShortText, Treatment], ...] = ()
     """The treatment of each round with its name; () for one round of the game as it is."""
@@ -35,10 +33,8 @@ class HostedSession(Hosting, stored=False, called="session"):
     def __post_init__(self) -> None:
         super().__post_init__()
         for word in self.agents:
-            if word not in (TRAINED, *SCRIPTED_POLICIES):
-                raise refusal("session.agents", word, ", ".join((TRAINED, *SCRIPTED_POLICIES)))
-        if self.absent not in (STAY, *SCRIPTED_POLICIES):
-            raise refusal("session.absent", self.absent, ", ".join((STAY, *SCRIPTED_POLICIES)))
+            checked("session.agents", word, Literal["trained"] | ScriptedPolicy)
+        checked("session.absent", self.absent, Literal["stay"] | ScriptedPolicy)
 
     def games(self) -> list[tuple[str, Game]]:
         """Return the name and the game of each round, with a start for each agent.
@@ -106,23 +102,3 @@ class HostedSession(Hosting, stored=False, called="session"):
 def with_turns(game: Game, turns: int) -> Game:
     """Return a game whose episodes have so many turns at most."""
     return replace(game, rules=replace(game.rules, episode_steps=turns))
-
-
-def instructions_of(game: Game, view: str) -> list[str]:
-    """Return the rules of a game in sentences, for those who play it."""
-    tag = tag_of(game)
-    seen = "the whole board" if view == "board" else "the cells around you, your heading up"
-    sentences = [growth_of(game), f"You see {seen}.", *([f"{capitalised(tag)}."] if tag else [])]
-    sentences += [meaning_of(institution, game) for institution in game.institutions]
-    steps = game.rules.episode_steps
-    return [*sentences, f"A round has {steps:,} turns at most; it ends earlier if no apple is left."]
-
-
-def options_of(game: Game) -> list[str] | None:
-    """Return the decisions of a game in words, in the order of their numbers; None without ballots."""
-    words = []
-    for ballot in game.ballots:
-        elected = "agent " * ballot.is_election
-        words.append([f"{ballot.title}: {elected}{choice:g}" for choice in ballot.choices])
-    # The first ballot changes fastest.
-    return ["; ".join(reversed(choices)) for choices in product(*reversed(words))] if words else None

@@ -14,7 +14,7 @@ import numpy as np
 
 from cprl import keys
 from cprl.commons.game import Game
-from cprl.evaluation.film import check_titles, titles_of
+from cprl.evaluation.film import check_beside, titles_of
 from cprl.evaluation.fresh import FreshEpisode, Recorded, fresh_episodes, print_descriptions, record
 from cprl.evaluation.populations import commons_game
 from cprl.measuring.social import equality
@@ -66,9 +66,7 @@ def show(
         FileExistsError: if the page exists.
     """
     runs = (run, *beside)
-    if len(runs) > _MOST_RUNS:
-        raise refusal("beside", f"{len(runs) - 1} runs", f"at most {_MOST_RUNS - 1}")
-    check_titles(tuple(titles), len(runs))
+    check_beside(runs, tuple(titles), most=_MOST_RUNS)
     if out is not None:
         Page(out).refuse()
     fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
@@ -156,14 +154,13 @@ def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, 
     `data` is what changes from turn to turn: JSON, compressed by zlib and encoded in base64.
     """
     game = commons_game(fresh.run)
-    violated = played.since_the_start("next", *keys.VIOLATED) > 0
     moments = [
         {
             "harvest": world.harvested.tolist(),
             "stock": int(world.stock.sum()),
             "board": moment_json(game.map, world, broken),
         }
-        for world, broken in zip(played.boards, violated, strict=True)
+        for world, broken in zip(played.boards, played.violated, strict=True)
     ]
     shares = equality(np.stack([world.harvested for world in played.boards]))
     changing = {

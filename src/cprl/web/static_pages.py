@@ -12,8 +12,8 @@ def page_of(template: str, *names: str, **parts: str) -> str:
     The page runs no other script, and asks no other server than the one that it comes from.
 
     Args:
-        template: the name of an .html file of `static`. In it `$style`, `$script`, `$policy` and `$` before a
-            name of `parts` stand for what is put there.
+        template: the name of an .html file of `static`. In it `$head` stands for head.html, and in both
+            `$style`, `$script`, `$policy` and `$` before a name of `parts` for what is put there.
         names: names of .css and .js files of `static`. The style begins with `style.css`.
         parts: HTML, or JSON without "<", by the name in the template.
     """
@@ -26,7 +26,8 @@ def page_of(template: str, *names: str, **parts: str) -> str:
     )
     inserted = {**parts, "style": style, "script": script, "policy": policy}
     pattern = rf"\$({'|'.join(inserted)})\b"
-    return re.sub(pattern, lambda name: inserted[name[1]], static_text(template))
+    text = static_text(template).replace("$head", static_text("head.html").rstrip())
+    return re.sub(pattern, lambda name: inserted[name[1]], text)
 
 
 def static_text(name: str) -> str:

@@ -280,10 +280,13 @@ function show() {
   else showReading();
 }
 
+/** Returns what people read of a treatment. */
+const ruleName = (rule) => rule === "none" ? "no added rule" : rule;
+
 /** Returns the round that is on, in words. */
 function placeWords() {
   const {round, rounds, rule} = state.round;
-  return round ? `Round ${round} of ${rounds}: ${rule}` : "Practice: nothing counts yet";
+  return round ? `Round ${round} of ${rounds}: ${ruleName(rule)}` : "Practice: nothing counts yet";
 }
 
 /** Shows the board or the window, and the scores. */
@@ -389,7 +392,7 @@ function readStart() { element("subject").textContent = "It begins…"; }
 function readRound(texts, button) {
   const {round, stage, before} = state;
   if (!round) return;
-  const isNew = round.round ? `Round ${round.round} of ${round.rounds}: ${round.rule}` : "First a practice round";
+  const isNew = round.round ? `Round ${round.round} of ${round.rounds}: ${ruleName(round.rule)}` : "First a practice round";
   element("subject").textContent = isNew;
   const list = made("ul", texts);
   writeHowTo(list);
@@ -432,7 +435,7 @@ function resultTable(parent, rounds) {
   const agents = rounds[0].harvest.map((_, agent) => agent);
   const hasIncome = rounds.some((round) => round.income?.some((value, agent) => value !== round.harvest[agent]));
   made("th", head, hasIncome ? "apples (net of fines and transfers)" : "apples");
-  for (const round of rounds) made("th", head, round.rule);
+  for (const round of rounds) made("th", head, ruleName(round.rule));
   const row = (words, values, name = "") => {
     const line = made("tr", body, "", name);
     made("td", line, words);
@@ -446,8 +449,12 @@ function resultTable(parent, rounds) {
   row("all together", rounds.map(({harvest}) => number(harvest.reduce((all, one) => all + one, 0))), "sum");
   row("turns that the board lasted", rounds.map((round) => number(round.survival_steps)));
   if (!rounds.some((round) => round.trained)) return;
-  const trained = (name, digits) => rounds.map((round) =>
-    round.trained ? number(Number(round.trained[name].toFixed(digits))) : "–");
+  const trained = (name, digits) => rounds.map((round) => {
+    if (!round.trained) return "–";
+    const rounded = (value) => number(Number(value.toFixed(digits)));
+    const interval = round.trained[`${name}_interval`];
+    return rounded(round.trained[name]) + (interval ? ` [${interval.map(rounded).join(", ")}]` : "");
+  });
   row("trained agents: each, on average", trained("harvest", 1), "sum");
   row("trained agents: turns, on average", trained("survival_steps", 0));
 }

@@ -1,12 +1,9 @@
-"""Draws the pictures of a film, with one run's board, stock and harvests, and writes its file."""
+"""Draws an episode turn by turn, as films show it: its board, its apples and its harvests in one picture."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Sequence
 from functools import cache
-from importlib.util import find_spec
 from math import ceil
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, Final
 
 import matplotlib
@@ -19,7 +16,6 @@ from cprl.commons.maps import Map
 from cprl.commons.world import WorldView
 from cprl.pictures.colours import PALETTE, agent_colour
 from cprl.pictures.image import world_image
-from cprl.runs.files import write_atomically
 from cprl.values.array_types import Int32, Int64, UInt8
 
 SMALLEST_WIDTH: Final = 240
@@ -35,8 +31,8 @@ _BOARD_HEIGHT: Final = 2
 """The largest height of the board, as a multiple of the picture's width."""
 _PLOT_HEIGHT: Final = 7
 """The height of a plot in units; a unit is the height of small text."""
-_DIAMOND_BEYOND: Final = 0.22
-"""The length by which a violator's diamond extends beyond its cell, in cells."""
+_DIAMOND_RADIUS: Final = 0.72
+"""The distance of the corners of a violator's diamond from the middle of its cell, in cells."""
 _TEXT: Final = (228, 231, 236)
 _FAINT: Final = (140, 146, 158)
 _LINE: Final = (52, 56, 66)
@@ -136,13 +132,11 @@ class EpisodePicture:
         An agent that is out of play, because a sanction took effect at once, also gets its number.
         """
         left, top, right, bottom = self.cell_box(int(moment.row[agent]), int(moment.col[agent]))
-        x = (left + right) / 2
-        y = (top + bottom) / 2
-        beyond = (right - left) * _DIAMOND_BEYOND
-        corners = [(x, top - beyond), (right + beyond, y), (x, bottom + beyond), (left - beyond, y)]
-        draw.line([*corners, *corners[:2]], _TEXT, max(1, self._unit // 5), joint="curve")
+        centre = (left + right) / 2, (top + bottom) / 2
+        circle = *centre, (right - left) * _DIAMOND_RADIUS
+        draw.regular_polygon(circle, 4, 45, outline=_TEXT, width=max(1, self._unit // 5))
         if not moment.in_play[agent]:
-            draw.text((x, y), str(agent), agent_colour(agent), self._font, anchor="mm")
+            draw.text(centre, str(agent), agent_colour(agent), self._font, anchor="mm")
 
     def cell_box(self, row: int, col: int) -> tuple[float, float, float, float]:
         """Return the left, top, right and bottom edge of a cell in the picture, in pixels."""
@@ -270,74 +264,3 @@ def note(text: str, width: int) -> UInt8:
     spacing = line_height - font.size
     ImageDraw.Draw(image).multiline_text((edge, 0), "\n".join(lines), _FAINT, font, spacing=spacing)
     return np.asarray(image)
-
-
-HOLD_S: Final = 2.0
-"""The seconds for which the last picture is shown."""
-
-_GIF_COLOURS: Final = 127
-"""The number of colours in a GIF. With one more for unchanged pixels, a pixel takes at most seven bits."""
-
-
-def check_can_write_mp4(path: Path) -> None:
-    """Raise a ModuleNotFoundError with the command to install imageio-ffmpeg if it is not installed."""
-    if find_spec("imageio_ffmpeg") is None:
-        raise ModuleNotFoundError(
-            f"{path}: an .mp4 needs imageio-ffmpeg, which is not installed; "
-            'run pip install "cprl[film]", or name a .gif'
-        )
-
-
-def write_gif(path: Path, pictures: Iterable[UInt8], samples: Sequence[UInt8], *, fps: float) -> None:
-    """Write a GIF that repeats, with one palette for all pictures.
-
-    Args:
-        pictures: the pictures, uint8 [height, width, 3] each, RGB.
-        samples: some of the pictures, whose most frequent colours are the palette; any other colour becomes
-            the nearest of these.
-        fps: the pictures per second, rounded so that a picture lasts whole hundredths of a second.
-    """
-    counts: Any = Image.fromarray(np.concatenate(samples)).getcolors(2**24)
-    known = np.array([colour for _, colour in sorted(counts, reverse=True)[:_GIF_COLOURS]])
-    palette = known.astype(np.uint8).tobytes() + bytes(3)
-    index = np.full(2**24, -1, np.int16)
-
-    def indexed(picture: UInt8) -> Image.Image:
-        # Pillow's own quantize treats colours as equal that differ by up to 4.
-        packed = picture @ np.array([1 << 16, 1 << 8, 1], np.int32)
-        new = np.unique(packed[index[packed] < 0])
-        differences = np.stack([new >> 16, new >> 8 & 255, new & 255], -1)[:, None] - known
-        index[new] = (differences**2).sum(-1).argmin(1)
-        image = Image.fromarray(index[packed].astype(np.uint8), "P")
-        image.putpalette(palette)
-        return image
-
-    first, *others = map(indexed, pictures)
-    options = {
-        "append_images": others,
-        "duration": [10 * max(2, round(100 / fps))] * len(others) + [round(1000 * HOLD_S)],
-        "palette": palette,
-        "transparency": len(known),
-    }
-    write_atomically(
-        path, lambda file: first.save(file, format="GIF", save_all=True, loop=0, optimize=True, **options)
-    )
-
-
-def write_mp4(path: Path, pictures: Iterator[UInt8], *, fps: float) -> None:
-    """Write an MP4, whose last picture is shown for `HOLD_S` seconds."""
-    from imageio_ffmpeg import write_frames
-
-    look: Any = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    picture = next(pictures)
-    height, width, _ = picture.shape
-    with TemporaryDirectory() as folder:
-        partial = Path(folder) / "film.mp4"
-        with closing(write_frames(partial, (width, height), fps=fps, **look)) as video:
-            video.send(None)
-            video.send(np.ascontiguousarray(picture))
-            for picture in pictures:
-                video.send(np.ascontiguousarray(picture))
-            for _ in range(round(HOLD_S * fps) - 1):
-                video.send(np.ascontiguousarray(picture))
-        write_atomically(path, lambda file: file.write(partial.read_bytes()))

@@ -1,0 +1,122 @@
+"""Governor: sets a number of another institution every few turns, by what anybody could see.
+
+No agent votes on the number. An experiment says by what the governor decides, see `Experiment.governor`.
+"""
+
+from dataclasses import dataclass
+from typing import Annotated, Any, ClassVar, Final, Literal
+
+import numpy as np
+
+from cprl.institutions.institution import Ballot, Institution
+from cprl.institutions.quotas import Quota
+from cprl.institutions.taxes import Tax
+from cprl.institutions.votes import Choices
+from cprl.values import Custom, Positive, Share, Where
+from cprl.values.array_types import AnyArray, Float32
+
+Number = Literal["quota.share", "tax.rate"]
+SETS: Final[dict[str, type[Tax | Quota]]] = {"quota.share": Quota, "tax.rate": Tax}
+"""The kind of institution that has each number."""
+Sight = Literal["stock", "harvest", "lowest_harvest", "violations", "time"]
+Objective = Literal["income", "lowest_income", "income_times_equality"]
+Sights = Annotated[
+    tuple[Sight, ...],
+    Where(lambda sees: sees and len(set(sees)) == len(sees), "one or more names, each once"),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Governor(Institution):
+    """A governor sets the share of a quota or the rate of a tax, in each world by itself.
+
+    It decides before the first turn of a training or an evaluation, and then after every `every_steps` turns.
+    Its number stays in force until it decides again, also where a new episode begins. Without a governor in
+    `Experiment.governor` the first option stays in force. Agents observe the number in force, a new one from
+    the turn after the first under it.
+    """
+
+    sets: Number
+    """The number that it sets, of the first institution of this kind in the game; its value there is not
+    used."""
+
+    options: Choices = (0.0, 0.25, 0.5, 0.75, 1.0)
+    """The values to choose from, at least two, in ascending order; for a tax in 0..1."""
+
+    every_steps: Positive = 50
+    """The length of a period: the turns from one decision to the next."""
+
+    sees: Sights = ("stock", "harvest", "lowest_harvest", "violations", "time")
+    """What it sees of a world: "stock", the share of all sites that hold an apple; of the episode so far
+    "harvest", the apples per turn of all agents, "lowest_harvest", the lowest harvest of an agent relative to
+    the mean, and "violations", the share of turns in which an agent broke a rule; "time", the part of the
+    longest episode that is over."""
+
+    objective: Objective | Custom = "income"
+    """What it wants of a period, see `cprl.measuring.welfare`; or a function of its own, which returns a
+    number for each world, [B], of the incomes [B, N] and the turns played [B]."""
+
+    least_stock: Share = 0.0
+    """The share of all sites below which the stock must not fall: the objective of a period that ends below
+    it is 0."""
+
+    at_most: ClassVar[int | None] = 1
+
+    def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
+        return [("in force", ballot)]
+
+    def governed(self, game: Any) -> Institution | None:
+        """Return the institution whose number it sets; None if the game has none."""
+        kind = SETS[self.sets]
+        return next((other for other in game.institutions if type(other) is kind), None)
+
+    @property
+    def decided(self) -> Ballot:
+        """Return what it decides, in the form of a ballot that is never held."""
+        return Ballot(SETS[self.sets].voted_on, self.options, False, 0, 0.0)
+
+    def check(self, game: Any) -> None:
+        governed = self.governed(game)
+        if governed is None:
+            raise ValueError(
+                f'Governor.sets is "{self.sets}"; allowed: a number of an institution of the game that no '
+                f"agent votes on, here {[name for name, kind in SETS.items() if _has(game, kind)]}"
+            )
+        if isinstance(governed, Tax) and (governed.brackets or self.options[-1] > 1):
+            raise ValueError(
+                f"Governor.options goes up to {self.options[-1]:g} for {governed}; allowed: 0..1, for a Tax "
+                "without brackets"
+            )
+        if self.every_steps > game.rules.episode_steps:
+            raise ValueError(
+                f"Governor.every_steps is {self.every_steps}; allowed: up to the {game.rules.episode_steps} "
+                "turns of an episode"
+            )
+
+    def see(
+        self, stock: AnyArray, steps: AnyArray, harvested: AnyArray, violations: AnyArray, clock: int
+    ) -> Float32:
+        """Return what it sees of B worlds, [B, F], in the order of `sees`.
+
+        Args:
+            stock: the share of all sites that hold an apple, [B].
+            steps: the turns of the episode so far, [B].
+            harvested: the apples of each agent in the episode so far, [B, N].
+            violations: the turns in which each agent broke a rule, [B, N].
+            clock: the turns of the longest episode.
+        """
+        played = np.maximum(steps, 1)
+        mean = harvested.mean(1)
+        sights = {
+            "stock": stock,
+            "harvest": harvested.sum(1) / played,
+            "lowest_harvest": np.where(mean > 0, harvested.min(1) / np.maximum(mean, 1e-9), 1.0),
+            "violations": violations.mean(1) / played,
+            "time": steps / clock,
+        }
+        return np.stack([sights[name] for name in self.sees], 1).astype(np.float32)
+
+
+def _has(game: Any, kind: type[Institution]) -> bool:
+    """Return whether a game has an institution of a kind that no agent votes on."""
+    return any(type(institution) is kind for institution in game.institutions)

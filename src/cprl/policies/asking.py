@@ -1,0 +1,314 @@
+"""Ask a language model by the chat interface of OpenAI, and keep every call.
+
+A call is kept by the hash of its request, as a line of JSON, and what is kept is not asked again. So a run
+resumes, and replays without a network, bit for bit. A request has a seed of its own, so that equal prompts of
+two agents are two calls. Bad answers are kept like good ones. Nothing here prints, and no key is kept.
+"""
+
+import json
+import os
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from hashlib import sha256
+from http.client import HTTPException
+from os.path import isabs
+from pathlib import Path
+from threading import Lock
+from typing import Annotated, Any, Final, NamedTuple, TypeVar
+from urllib.error import HTTPError
+from urllib.request import Request, urlopen
+
+from cprl.values import Natural, Positive, Range, Value, Where, short_repr
+
+T = TypeVar("T")
+Text = Annotated[str, Where(lambda text: "\0" not in text, "a text without NUL")]
+
+CALLS: Final = "calls.jsonl"
+"""The file of a run with its calls."""
+OVER_LIMIT: Final = "more than max_calls"
+"""What is kept of a call that was not made."""
+_FIELDS: Final = (
+    *("hash", "call", "request", "answer", "failure", "tries", "seconds"),
+    *("prompt_tokens", "answer_tokens"),
+)
+"""What is kept of a call."""
+_MOST_BYTES: Final = 2**20
+"""The longest answer that is read."""
+_USAGE: Final = ("prompt_tokens", "completion_tokens")
+_BROKEN: Final = (
+    *(HTTPException, ValueError, LookupError, TypeError, AttributeError),
+    *(ArithmeticError, RecursionError),
+)
+"""What reading half an answer, or one of another form, raises."""
+_BUSY: Final = (408, 429)
+"""The statuses below 500 after which a call is tried again."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Model(Value, stored=False):
+    """A language model at a server with `/chat/completions`, and how it may be asked."""
+
+    model: Text
+    """The model's name at the server, e.g. "qwen3:4b"."""
+    base_url: Annotated[
+        str, Where(lambda url: url.startswith(("http://", "https://")), "an address, http:// or https://")
+    ] = "http://localhost:11434/v1"
+    """The address before `/chat/completions`; by default that of Ollama on this machine."""
+    key_variable: Text | None = None
+    """The environment variable that holds the server's key, e.g. "OPENAI_API_KEY"; None for no key. The key
+    itself is never stored."""
+    temperature: Annotated[float, Range(0, 2)] = 0.0
+    """The temperature at which the model samples."""
+    max_tokens: Positive = 200
+    """The most tokens of an answer."""
+    max_calls: Positive = 10_000
+    """The most calls of a run, of all its agents; later ones are not made."""
+    timeout_s: Annotated[float, Range(0.01, 3600)] = 60.0
+    """The most seconds that a try takes."""
+    retries: Annotated[int, Range(0, 20)] = 2
+    """How often a call is tried again, after silence or where the server is busy or fails."""
+    backoff_s: Annotated[float, Range(0, 600)] = 1.0
+    """The seconds before the first retry, doubled before each further one."""
+    concurrency: Annotated[int, Range(1, 256)] = 4
+    """The most calls at the same time."""
+    stored: (
+        Annotated[Text, Where(lambda path: not isabs(path), "a path from the working directory")] | None
+    ) = None
+    """The directory of a run whose calls answer instead of the server; a request that it does not keep is
+    refused by name. None to ask the server."""
+
+
+class Question(NamedTuple):
+    """What is asked in a call."""
+
+    call: str
+    """The name of the call, e.g. "seed 0, replica 0, agent 2, world 0, call 3"."""
+    seed: Natural
+    system: str
+    prompt: str
+
+    def request(self, model: Model) -> dict[str, Any]:
+        """Return the body of the request."""
+        return {
+            "model": model.model,
+            "messages": [
+                {"role": "system", "content": self.system},
+                {"role": "user", "content": self.prompt},
+            ],
+            "temperature": model.temperature,
+            "max_tokens": model.max_tokens,
+            "seed": self.seed,
+            "response_format": {"type": "json_object"},
+        }
+
+
+class Calls:
+    """The calls of a run, each made once; kept in a file if there is one."""
+
+    def __init__(self) -> None:
+        self.kept: dict[str, dict[str, Any]] = {}
+        """The calls by the hashes of their requests."""
+        self._path: Path | None = None
+        self._lock = Lock()
+
+    def keep_in(self, path: Path) -> None:
+        """Read the calls that a file holds, and append further ones."""
+        self._path = path
+        self.kept |= read_calls(path)
+
+    def ask(self, model: Model, questions: Sequence[Question], read: Callable[[Any], T]) -> list[T | None]:
+        """Return what a model answers, several questions at once; what is kept is not asked again.
+
+        Args:
+            read: returns what the JSON of an answer says; raises a ValueError if that is not allowed.
+
+        Returns:
+            An entry for each question; None where the answer is bad or missing.
+
+        Raises:
+            ValueError: if `Model.stored` lacks a call.
+            ConnectionError: if the first call of all fails in a way that a retry cannot change.
+        """
+        hashes = [_hash(question.request(model)) for question in questions]
+        by_hash = dict(zip(hashes, questions, strict=True))
+        new = [question for name, question in by_hash.items() if name not in self.kept]
+        if new and model.stored is not None:
+            self._take(model, new)
+        elif new:
+            made = sum(call["tries"] > 0 for call in self.kept.values())
+            count = max(0, model.max_calls - made)
+
+            def make(index: int) -> None:
+                self._make(model, new[index], read, is_allowed=index < count)
+
+            with ThreadPoolExecutor(model.concurrency) as pool:
+                list(pool.map(make, range(len(new))))
+        return [_understood(self.kept[name]["answer"], read)[0] for name in hashes]
+
+    def _make(
+        self, model: Model, question: Question, read: Callable[[Any], Any], *, is_allowed: bool
+    ) -> None:
+        """Make a call, and keep what came of it."""
+        request = question.request(model)
+        began = time.monotonic()
+        tries = 0
+        outcome = _Outcome(None, OVER_LIMIT)
+        while is_allowed and tries <= model.retries:
+            if tries:
+                time.sleep(model.backoff_s * 2 ** (tries - 1))
+            tries += 1
+            outcome = _post(model, request)
+            if not outcome.may_retry:
+                break
+        if outcome.is_refused and all(call["answer"] is None for call in self.kept.values()):
+            raise ConnectionError(f"{model.base_url} with the model {model.model!r}: {outcome.failure}")
+        self._keep(
+            {
+                "hash": _hash(request),
+                "call": question.call,
+                "request": request,
+                "answer": outcome.answer,
+                "failure": outcome.failure or _understood(outcome.answer, read)[1],
+                "tries": tries,
+                "seconds": round(time.monotonic() - began, 3),
+                "prompt_tokens": outcome.prompt_tokens,
+                "answer_tokens": outcome.answer_tokens,
+            }
+        )
+
+    def _take(self, model: Model, questions: Sequence[Question]) -> None:
+        """Take calls from another run; refuse those that it does not keep."""
+        path = Path(str(model.stored)) / CALLS
+        stored = read_calls(path)
+        for question in questions:
+            request = question.request(model)
+            name = _hash(request)
+            if name not in stored:
+                raise ValueError(
+                    f"{path} keeps no answer for {question.call}: {_differs(stored, question.call, request)}"
+                )
+            self._keep(stored[name])
+
+    def _keep(self, call: dict[str, Any]) -> None:
+        with self._lock:
+            if self._path is not None:
+                _append(self._path, json.dumps(call).encode())
+            self.kept[call["hash"]] = call
+
+    def in_words(self) -> str:
+        """Return how many calls were made, their tokens and their failures; "" without any."""
+        calls = self.kept.values()
+        if not calls:
+            return ""
+        made = sum(call["tries"] > 0 for call in calls)
+        tokens = sum(call["prompt_tokens"] for call in calls)
+        answered = sum(call["answer_tokens"] for call in calls)
+        failed = sum(call["failure"] is not None for call in calls)
+        return f"{made:,} calls, {tokens:,} + {answered:,} tokens, {failed:,} without a usable answer"
+
+
+class _Outcome(NamedTuple):
+    """What came of a try."""
+
+    answer: str | None
+    failure: str | None = None
+    prompt_tokens: int = 0
+    answer_tokens: int = 0
+    may_retry: bool = False
+    is_refused: bool = False
+    """Whether the server is not there, or refuses the request."""
+
+
+def read_calls(path: Path) -> dict[str, dict[str, Any]]:
+    """Return the calls that a file keeps, by the hashes of their requests, without a line that was cut."""
+    calls = {}
+    for line in path.read_bytes().splitlines() if path.is_file() else ():
+        try:
+            call = json.loads(line)
+        except ValueError:  # the process was killed while it wrote
+            continue
+        try:
+            calls[_hash(call["request"])] = {name: call[name] for name in _FIELDS}
+        except (TypeError, LookupError):
+            raise ValueError(f"{path} holds {short_repr(call)}; allowed: calls as cprl keeps them") from None
+    return calls
+
+
+def _append(path: Path, line: bytes) -> None:
+    """Append a line to a file, whose last one may have been cut."""
+    with open(path, "a+b") as file:
+        if file.tell():
+            file.seek(-1, os.SEEK_END)
+            line = line if file.read() == b"\n" else b"\n" + line
+        file.write(line + b"\n")
+
+
+def _hash(request: dict[str, Any]) -> str:
+    return sha256(json.dumps(request, sort_keys=True).encode()).hexdigest()
+
+
+def _post(model: Model, request: dict[str, Any]) -> _Outcome:
+    """Post a request once."""
+    message = Request(f"{model.base_url.rstrip('/')}/chat/completions", json.dumps(request).encode())
+    message.add_header("Content-Type", "application/json")
+    key = os.environ.get(model.key_variable or "", "")
+    if key:
+        message.add_unredirected_header("Authorization", f"Bearer {key}")
+    try:
+        table = json.loads(_body(message, model.timeout_s))
+        answer = table["choices"][0]["message"]["content"]
+        usage = table.get("usage") or {}
+        prompt_tokens, answer_tokens = (int(usage.get(name) or 0) for name in _USAGE)
+    except HTTPError as error:
+        is_busy = error.code in _BUSY or error.code >= 500
+        return _Outcome(None, f"status {error.code}", may_retry=is_busy, is_refused=not is_busy)
+    except OSError as error:
+        reason = getattr(error, "reason", error)
+        if isinstance(reason, TimeoutError):
+            return _Outcome(None, "no answer in time", may_retry=True)
+        return _Outcome(None, f"no connection: {reason}", may_retry=True, is_refused=True)
+    except _BROKEN as error:
+        return _Outcome(None, f"a broken answer: {type(error).__name__}", may_retry=True)
+    failure = None if isinstance(answer, str) else "an answer without text"
+    return _Outcome(None if failure else answer, failure, prompt_tokens, answer_tokens)
+
+
+def _body(message: Request, timeout_s: float) -> bytes:
+    """Return the body of an answer; raise a TimeoutError if it comes too slowly."""
+    ends = time.monotonic() + timeout_s
+    body = b""
+    with urlopen(message, timeout=timeout_s) as response:
+        while part := response.read1(2**16):
+            body += part
+            if time.monotonic() > ends:
+                raise TimeoutError
+            if len(body) > _MOST_BYTES:
+                raise ValueError("too long")
+        if response.length:
+            raise ValueError("half an answer")
+    return body
+
+
+def _understood(answer: str | None, read: Callable[[Any], T]) -> tuple[T | None, str | None]:
+    """Return what an answer says, or why it says nothing."""
+    if answer is None:
+        return None, None
+    try:
+        table, _ = json.JSONDecoder().raw_decode(answer, answer.index("{"))
+    except (ValueError, RecursionError):
+        return None, "no JSON"
+    try:
+        return read(table), None
+    except ValueError as error:
+        return None, str(error)
+
+
+def _differs(stored: dict[str, dict[str, Any]], name: str, request: dict[str, Any]) -> str:
+    """Return what differs between a request and the stored one of the same name."""
+    for call in stored.values():
+        if call["call"] == name:
+            changed = [part for part in request if request[part] != call["request"].get(part)]
+            return f"it keeps one with another {' and '.join(changed)}"
+    return "it keeps none of that name"

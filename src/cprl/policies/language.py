@@ -1,0 +1,289 @@
+"""LanguageActor: agents for which a language model makes plans.
+
+Every some steps the model is shown what the agent observes, as text, and answers a plan as JSON: a scripted
+policy and its numbers, which the agent follows until the next. In a game that is no `cprl.Game` it is shown
+the numbers that the agent observes, and answers an action. Where an answer is bad or missing, the agent falls
+back to a policy that was said beforehand.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
+
+import numpy as np
+import torch
+from tensordict import TensorDictBase
+from tensordict.nn import TensorDictModuleBase
+
+from cprl import keys, recurrent_state
+from cprl.commons.cells import class_name
+from cprl.commons.game import Game
+from cprl.commons.spaces import Spaces
+from cprl.pictures.decoding import SIGNS, window_text
+from cprl.pictures.readable import instructions_of
+from cprl.policies.actors import LaneActor
+from cprl.policies.asking import Calls, Model, Question, Text
+from cprl.policies.rng import Purpose, seed_of
+from cprl.policies.scripted import (
+    BEHAVIOURS,
+    SCRIPTED_POLICIES,
+    SPARE,
+    ScriptedActor,
+    ScriptedPolicy,
+    scripted_lanes,
+)
+from cprl.values import Natural, Positive, Range, Value, build, checked
+from cprl.values.array_types import AnyArray, Float32, Int64
+
+_TURN, _LEFT, _HARVEST, _PLAN = range(4)
+"""The numbers that an agent carries from turn to turn: the turns of the episode so far, the turns left of its
+plan, its harvest; and where those of the plan begin."""
+_LARGEST_SEED: Final = 2**31
+
+
+@dataclass(frozen=True, kw_only=True)
+class Language(Model):
+    """An agent whose plans a language model makes, see `cprl.policies.language`. It does not learn."""
+
+    every_steps: Positive = 50
+    """The steps from one plan to the next; as many as an episode has for a plan an episode."""
+    fallback: ScriptedPolicy = "sustainable"
+    """What it does where the model gives no plan; "random" in a game that is no `cprl.Game`."""
+    instructions: Text = ""
+    """Text before all else: a persona, a norm, or what a game of your own is about."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Plan(Value, stored=False, called="plan"):
+    """What an agent does until the next plan."""
+
+    policy: ScriptedPolicy
+    spare: Annotated[int, Range(1, 8)] = SPARE
+    """The apples that "sustainable" leaves near each that it takes."""
+    signal: Natural = 0
+    """The signal that it sends in each turn, see `Rules.signals`; 0 for none."""
+    why: str = ""
+
+
+class _BoardPlans:
+    """Plans on a board: a scripted policy, the apples that it spares, and a signal.
+
+    Args:
+        game: the game that is played.
+        script: follows the policies; its own is the fallback.
+    """
+
+    def __init__(self, game: Game, script: ScriptedActor) -> None:
+        self.game = game
+        self.fallback: tuple[int, ...] = (SCRIPTED_POLICIES.index(script.policy), SPARE, 0)
+        """The numbers of the plan of an agent without an answer."""
+        self.in_keys: tuple[str, ...] = (keys.HARVEST[1], keys.IN_PLAY[1], *script.in_keys[1:])
+        """The entries of "agents" that it reads beside observations."""
+        self._script = script
+
+    def rules(self, spec: Language) -> str:
+        """Return what a model has to know before it answers."""
+        rules = self.game.rules
+        policies = [f'- "{policy}": {behaviour}' for policy, behaviour in BEHAVIOURS.items()]
+        signals = f', "signal": 0 to {rules.signals}, which others see' * bool(rules.signals)
+        return "\n".join(
+            [
+                f"You are one of {self.game.agents} agents on a board.",
+                *instructions_of(self.game, "window"),
+                "Each apple that you pick is a point for you.",
+                f"Every {spec.every_steps} turns you choose a plan, which is played for you. Answer with one",
+                "JSON object and nothing else:",
+                f'{{"why": "a short reason", "policy": a name of the list, "spare": 1 to 8{signals}}}',
+                *policies,
+            ]
+        )
+
+    def seen(self, observation: AnyArray, memory: Float32) -> str:
+        """Return in words what an agent observes, and carries from turn to turn."""
+        turn, _, harvest, *plan = memory.astype(np.int64).tolist()
+        lines = [f"Turn {turn + 1} of {self.game.rules.episode_steps}. You picked {harvest} apples so far."]
+        if turn:
+            lines.append(f"Your last plan: {self._in_words(plan)}.")
+        lines += self._planes(observation)
+        signs = ", ".join(f"{SIGNS.get(kind, 'O')} {class_name(kind)}" for kind in self.game.cell_classes)
+        return "\n".join(
+            [*lines, f"What you see, ahead is up ({signs}):", window_text(self.game, observation)]
+        )
+
+    def _in_words(self, plan: Sequence[int]) -> str:
+        policy, spare, signal = plan
+        return f"{SCRIPTED_POLICIES[policy]}, spare {spare}" + f", signal {signal}" * bool(signal)
+
+    def _planes(self, observation: AnyArray) -> list[str]:
+        """Return in words what the channels beside those of the board show, where the game has them."""
+        game = self.game
+        lines = []
+        for number in range(1, game.rules.signals + 1):
+            senders = np.count_nonzero(observation[game.channels.index(f"signal {number}")])
+            lines += [f"Signal {number} was sent by {senders} of those you see."] * bool(senders)
+        if game.observation.scoreboard:
+            bytes_ = self._entries(observation, "scoreboard")[: game.agents].astype(np.int64)
+            scores = len(game.map.sites) * bytes_ / np.maximum(1, 255 - bytes_)
+            words = ", ".join(f"{score:.0f}" for score in scores.tolist())
+            lines.append(f"Apples picked by you and the next agents: {words}.")
+        if game.observation.stock_gauge:
+            share = self._entries(observation, "stock_gauge")[0] / 255
+            lines.append(f"Of all places for apples {share:.0%} have one.")
+        if game.entries_shown:
+            values = self._entries(observation, "institutions") / 255
+            entries = zip(game.entries_shown, values.tolist(), strict=False)
+            lines.append("; ".join(f"{name}: {value:.2f}" for name, value in entries))
+        return lines
+
+    def _entries(self, observation: AnyArray, channel: str) -> AnyArray:
+        """Return the numbers that the channels of a name show."""
+        return observation[np.array(self.game.channels) == channel].reshape(-1)
+
+    def read(self, table: Any) -> tuple[int, ...]:
+        """Return the numbers of a plan; raise a ValueError if it is not allowed."""
+        plan = build(Plan, table, "plan")
+        checked("plan.signal", plan.signal, Annotated[int, Range(0, self.game.rules.signals)])
+        return SCRIPTED_POLICIES.index(plan.policy), plan.spare, plan.signal
+
+    def act(self, plans: Int64, tensordict: TensorDictBase) -> Int64:
+        """Return actions, int64 [B, S], by plans, [B, S, 3]."""
+        policies, spare, signal = np.moveaxis(plans, -1, 0)
+        seen = map(tensordict.get, self._script.in_keys)
+        silent = self._script.choose_each(policies, spare, *seen)
+        return silent + signal * self.game.tables.silent_actions
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Action(Value, stored=False, called="answer"):
+    action: Natural
+    why: str = ""
+
+
+class _PlainActions:
+    """Actions in a game that is no `cprl.Game`, which shows its agents numbers; a plan is an action."""
+
+    in_keys: tuple[str, ...] = ()
+    fallback: tuple[int, ...] = (-1,)
+
+    def __init__(self, spaces: Spaces, script: LaneActor) -> None:
+        self._actions = spaces.actions
+        self._script = script
+
+    def rules(self, spec: Language) -> str:
+        last = self._actions - 1
+        every = "each turn" if spec.every_steps == 1 else f"every {spec.every_steps} turns"
+        return (
+            f"You choose an action {every}. Answer with one JSON object and nothing else:\n"
+            f'{{"why": "a short reason", "action": an integer from 0 to {last}}}'
+        )
+
+    def seen(self, observation: AnyArray, memory: Float32) -> str:
+        turn = int(memory[_TURN])
+        last = f" Your last action: {memory[_PLAN]:g}." if turn else ""
+        numbers = " ".join(f"{number:g}" for number in observation.reshape(-1).tolist())
+        return f"Turn {turn + 1}.{last} You observe: {numbers}"
+
+    def read(self, table: Any) -> tuple[int, ...]:
+        action = build(_Action, table, "answer").action
+        return (checked("answer.action", action, Annotated[int, Range(0, self._actions - 1)]),)
+
+    def act(self, plans: Int64, tensordict: TensorDictBase) -> Int64:
+        at_random = self._script.choose(tensordict.get("observation")).numpy(force=True)
+        return np.where(plans[..., 0] < 0, at_random, plans[..., 0])
+
+
+class LanguageActor(TensorDictModuleBase):
+    """S agents of every replica for which a language model makes plans.
+
+    An agent asks where its plan has run out, while it is in play. Its plan, and what it remembers, are the
+    entry "recurrent_state", which is zero where an episode begins.
+
+    Args:
+        spec: the model, and how often it is asked.
+        playing: the game that the agents play, or its spaces if it is no `cprl.Game`.
+        calls: makes the calls, and keeps them.
+        seeds: the seed of each lane, lane = replica x S + agent.
+        agents: the number of agents S of each replica.
+        worlds: the number of worlds k of each replica, consecutive in the batch.
+    """
+
+    out_keys = ("action", recurrent_state.AFTER)
+
+    def __init__(
+        self,
+        spec: Language,
+        playing: Game | Spaces,
+        *,
+        calls: Calls,
+        seeds: Sequence[Sequence[int]],
+        agents: int,
+        worlds: int = 1,
+    ) -> None:
+        super().__init__()
+        self.spec = spec
+        self.playing = playing
+        self.agents = agents
+        self.worlds = worlds
+        self.replicas = len(seeds) // agents
+        size: dict[str, Any] = {"seeds": seeds, "agents": agents, "worlds": worlds}
+        self._answers: _BoardPlans | _PlainActions
+        if isinstance(playing, Game):
+            self.script: Any = ScriptedActor(spec.fallback, playing, **size)
+            self._answers = _BoardPlans(playing, self.script)
+        else:
+            self.script = scripted_lanes(spec.fallback, playing, **size)
+            self._answers = _PlainActions(playing, self.script)
+        self._system = "\n".join(filter(None, (spec.instructions, self._answers.rules(spec))))
+        self._calls = calls
+        self._seeds = [tuple(seed) for seed in seeds]
+        self._asked = np.zeros((len(seeds), worlds), np.int64)
+        """How often each lane has asked in each world."""
+        self.state_cells = _PLAN + len(self._answers.fallback)
+        self.in_keys = ("observation", recurrent_state.AFTER, keys.DONE, *self._answers.in_keys)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        observation = tensordict.get("observation")
+        memory = tensordict.get(recurrent_state.AFTER).numpy(force=True).copy()
+        begins = memory[..., _TURN] == 0
+        memory[begins, _PLAN:] = self._answers.fallback
+        due = (memory[..., _LEFT] == 0) & ~tensordict.get(keys.DONE).numpy(force=True)
+        if keys.HARVEST[1] in self.in_keys:
+            harvest = tensordict.get(keys.HARVEST[1]).numpy(force=True)
+            memory[..., _HARVEST] += np.where(begins, 0, harvest)
+            due &= tensordict.get(keys.IN_PLAY[1]).numpy(force=True)
+        if due.any():
+            self._ask(observation.numpy(force=True), memory, np.argwhere(due))
+            memory[due, _LEFT] = self.spec.every_steps
+        actions = self._answers.act(memory[..., _PLAN:].astype(np.int64), tensordict)
+        memory[..., _TURN] += 1
+        memory[..., _LEFT] = np.maximum(0, memory[..., _LEFT] - 1)
+        tensordict.set("action", torch.from_numpy(actions).to(observation.device))
+        return tensordict.set(recurrent_state.AFTER, torch.from_numpy(memory).to(observation.device))
+
+    def _ask(self, observation: AnyArray, memory: Float32, due: Int64) -> None:
+        """Ask for the plans of some agents, [n, 2] by world and agent, and write them into the memory."""
+        questions = []
+        for world, agent in due.tolist():
+            seen = self._answers.seen(observation[world, agent], memory[world, agent])
+            questions.append(self._question(world, agent, seen))
+        plans = self._calls.ask(self.spec, questions, self._answers.read)
+        for (world, agent), plan in zip(due.tolist(), plans, strict=True):
+            memory[world, agent, _PLAN:] = plan or self._answers.fallback
+
+    def _question(self, index: int, agent: int, seen: str) -> Question:
+        """Return what an agent of a world of the batch asks, and count it."""
+        replica, world = divmod(index, self.worlds)
+        lane = replica * self.agents + agent
+        number = int(self._asked[lane, world])
+        self._asked[lane, world] += 1
+        run_seed, replica_number, agent_number, *purpose = self._seeds[lane]
+        what = Purpose(tuple(purpose)).name.lower()
+        call = f"{what}, seed {run_seed}, replica {replica_number}, world {world}, agent {agent_number}, "
+        seed = seed_of((*self._seeds[lane], world, number)) % _LARGEST_SEED
+        return Question(f"{call}call {number}", seed, self._system, seen)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        return {"asked": torch.tensor(self._asked)}
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        self._asked[:] = state["asked"].numpy(force=True)
