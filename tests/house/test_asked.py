@@ -13,7 +13,7 @@ from changes import PPO_AGENT
 from courses import end_steps
 from finished import name_among
 from judging import FROZEN, LEARNING, MORE_EXPLORATION, Outcomes, contrast, judge, judged_lines, judged_page
-from recovery import first_back
+from recovery import first_back, recovery_page
 from schedules import exploration_at_end, target_period, updates
 from scipy import stats
 from sheet import sheet
@@ -288,6 +288,12 @@ JUDGED = [
 def test_judged_expectations_are_those_of_the_committed_tables(study):
     page = (RESULTS / study.stem / "judged.md").read_text(encoding="utf-8")
     assert "\n".join(judged_page(study, RESULTS)) == page
+
+
+@pytest.mark.integration
+def test_how_fast_incomes_are_back_is_that_of_the_committed_courses():
+    page = (RESULTS / "order" / "recovery.md").read_text(encoding="utf-8")
+    assert recovery_page(ROOT / "recipes" / "study" / "governs" / "order.py") == page
 
 
 @pytest.mark.integration

@@ -27,12 +27,11 @@ def round_and_turn(game, *, view="board", **fields):
     """The messages "round", and "turn" before the first, of a new world of a game."""
     batch = Batch(game, 1, seed=3)
     world = batch.show(batch.begin())
-    _, rows, columns = world.observation.shape[1:]
     names = ["person 0", "you", *(f"agent {agent} (greedy)" for agent in range(2, game.agents))]
     told = {
         **{"type": "round", "round": 1, "rounds": 2, "rule": "none", "instructions": ["Pick <b>apples</b>."]},
         **{"view": view, "turns_a_second": 8, "episode_steps": 240, "names": names, "options": None},
-        **{"actions": game.actions, "chat": False, "window_rows": rows, "window_columns": columns},
+        **{"actions": game.actions, "chat": False, "observation_shape": game.observation_shape},
         **{"window_colours": window_colours(game), **scene_json(game)},
     }
     turn = {"type": "turn", "turn": 0, "harvest": [0] * game.agents, "income": None, "ack": 0}

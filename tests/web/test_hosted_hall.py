@@ -4,6 +4,7 @@ import asyncio
 import json
 from base64 import b64decode
 from collections import Counter
+from dataclasses import replace
 from errno import ENOSPC
 from io import FileIO
 from types import SimpleNamespace
@@ -424,6 +425,9 @@ def test_a_person_sees_the_window_of_an_agent_and_a_program_its_observation(tmp_
         window, array, text = (player.of("turn")[-1] for player in players)
         shape = players[1].of("round")[0]["observation_shape"]
     assert "board" not in window
+    assert [apples is None for apples in window["harvest"]] == [False, True, True]
+    assert [apples is None for apples in text["harvest"]] == [True, True, False]
+    assert window["stock"] is window["income"] is None, "the game has neither scoreboard nor gauge"
     assert len(b64decode(window["window"])) == 15
     observed = np.frombuffer(b64decode(array["observation"]), np.uint8).reshape(shape)
     assert observed.shape == (3, 3, 5)
@@ -431,6 +435,17 @@ def test_a_person_sees_the_window_of_an_agent_and_a_program_its_observation(tmp_
     lines = text["text"].split("\n")
     assert len(lines) == 3
     assert lines[-1][2] == "@"
+
+
+def test_a_window_comes_with_the_numbers_that_the_game_shows(tmp_path, monkeypatch):
+    sees = cprl.Observation(scoreboard=True, stock_gauge=True)
+    game = replace(small_game(), observation=sees, institutions=(institutions.Tax(rate=0.5),))
+    with hosted(tmp_path / "out", session(game, view="window"), monkeypatch) as hall:
+        players = [Player(hall, actions=("stay",)).connect() for _ in range(2)]
+        asyncio.run(play_all(hall, *players, until=lambda: hall.rounds[0].turn > 1))
+        turn = players[0].of("turn")[-1]
+    assert turn["stock"] > 0
+    assert None not in turn["harvest"] + turn["income"]
 
 
 def test_rounds_that_people_cannot_play_are_refused_by_name_before_anybody_joins(tmp_path):

@@ -86,8 +86,8 @@ def recovery_row(study: str, expectation: Expectation) -> list[str]:
     ]
 
 
-def main(*, study: Path) -> None:
-    """Write the recovery of all pairs.
+def recovery_page(study: Path) -> str:
+    """Return the page of all pairs of a study, in Markdown.
 
     Args:
         study: the file of the study.
@@ -103,7 +103,16 @@ def main(*, study: Path) -> None:
         "",
         *table(HEAD, rows, numbers=4),
     ]
-    (RESULTS / name / "recovery.md").write_text("\n".join(lines), encoding="utf-8")
+    return "\n".join(lines)
+
+
+def main(*, study: Path) -> None:
+    """Write the recovery of all pairs.
+
+    Args:
+        study: the file of the study.
+    """
+    (RESULTS / study.stem / "recovery.md").write_text(recovery_page(study), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -273,8 +273,7 @@ class Recorded(NamedTuple):
     @property
     def violated(self) -> Bool:
         """Return who broke a rule in the turn before each board, bool [T + 1, N]."""
-        violated: Bool = self.since_the_start("next", *keys.VIOLATED) > 0
-        return violated
+        return np.asarray(self.since_the_start("next", *keys.VIOLATED) > 0)
 
     def since_the_start(self, *key: str) -> Any:
         """Return an entry of agents after each turn, with zeros for the start, [T + 1, N].

@@ -81,8 +81,7 @@ class Session:
     @property
     def harvested(self) -> list[int]:
         """Return the apples that each agent has harvested so far."""
-        harvested: list[int] = self.moments[-1].harvested.tolist()
-        return harvested
+        return list(map(int, self.moments[-1].harvested))
 
     @property
     def stock(self) -> int:

@@ -430,8 +430,7 @@ class Hall:
             return
         form = seat.view or self.session.view
         if form != "board":
-            view = {**view, **this.seen(seat.group, seat.agent, form)}
-            del view["board"]
+            view = this.narrowed(view, seat.group, seat.agent, form)
         in_play = bool(this.in_play()[seat.group, seat.agent])
         seat.outbox.show(messages.write("turn", **view, in_play=in_play, ack=seat.number))
 

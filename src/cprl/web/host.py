@@ -96,9 +96,8 @@ async def serve_session(hall: Hall, *, port: int, in_room: bool = False) -> None
         in_room: whether other machines of the local network may join.
     """
     address = address_in_room() if in_room else "127.0.0.1"
-    addresses = list(dict.fromkeys((address, "127.0.0.1")))
-    async with serving(routes_of(hall), addresses, port) as places:
-        _announce(f"http://{places[0][0]}:{places[0][1]}/#{hall.token}", hall, in_room=in_room)
+    async with serving(routes_of(hall), list({address, "127.0.0.1"}), port) as places:
+        _announce(f"http://{address}:{dict(places)[address]}/#{hall.token}", hall, in_room=in_room)
         with suppress(NotImplementedError, ValueError, OSError):  # no terminal, or Windows
             if sys.stdin.isatty():
                 asyncio.get_running_loop().add_reader(sys.stdin.fileno(), _read_enter, hall)

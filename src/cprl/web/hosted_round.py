@@ -333,8 +333,6 @@ class HostedRound:
             "options": options_of(game),
             "chat": self.has_chat,
             "observation_shape": game.observation_shape,
-            "window_rows": game.observation_shape[1],
-            "window_columns": game.observation_shape[2],
             "window_colours": window_colours(game),
             **scene_json(game),
         }
@@ -368,6 +366,23 @@ class HostedRound:
         in_play: Bool = self._moment[keys.IN_PLAY].numpy().copy()
         in_play[[*self.episodes]] = False
         return in_play
+
+    def narrowed(self, view: dict[str, Any], group: int, agent: int, form: str) -> dict[str, Any]:
+        """Return a group's part of "turn" for who sees no board.
+
+        Args:
+            view: that of `views`; numbers that the game does not show its agents become None.
+            form: the form of what the agent observes, see `seen`.
+        """
+        narrowed = {**view, **self.seen(group, agent, form)}
+        del narrowed["board"]
+        if not self.game.observation.stock_gauge:
+            narrowed["stock"] = None
+        for name in ("harvest", "income"):
+            if view[name] and not self.game.observation.scoreboard:
+                narrowed[name] = [None] * self.game.agents
+                narrowed[name][agent] = view[name][agent]
+        return narrowed
 
     def seen(self, group: int, agent: int, view: str) -> dict[str, str]:
         """Return what an agent observes, in the form that its seat asks for: "window", "array" or "text"."""

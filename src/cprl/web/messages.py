@@ -32,11 +32,13 @@ From the server come:
                seats, round (0: practice), rounds, seconds (until it ends by itself, or null)
     round      what does not change in a round: round, rounds, rule, instructions (sentences), view,
                turns_a_second (null: a turn when all have chosen), episode_steps, names, actions, options (of
-               the vote, or null), chat, observation_shape, window_rows, window_columns, window_colours, and
+               the vote, or null), chat, observation_shape, window_colours, and
                the scene of the board: width, height, walls, sites, river, regions, colours, marks, palette; a
                cell is row * width + column
     turn       turn (0: before the first), harvest and income (of each agent; income null without
-               institutions), stock, rule_in_force, in_play (whether one can act), ack, and one of
+               institutions), stock, rule_in_force, in_play (whether one can act), ack; for who sees no board
+               others' numbers are null in games without a scoreboard, the stock in those without a gauge;
+               and one of
                  board        apples (hex, a bit a site), waste, cells, poses (heading + 4 in play + 8 broke a
                               rule), beams
                  window       base64 of the classes of the cells that one sees, a byte a cell, row by row

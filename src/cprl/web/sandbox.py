@@ -237,8 +237,7 @@ def _course(run: Path) -> list[float]:
         curves = curves_of(run)
     except (OSError, ValueError):  # it has not begun
         return []
-    course: list[float] = curves[COLLECTIVE_RETURN][0].tolist() if curves else []
-    return course
+    return list(curves[COLLECTIVE_RETURN][0]) if curves else []
 
 
 def sandbox_page() -> str:

@@ -107,7 +107,7 @@ const RECEIVE = {
     if (!isSame) state.before = state.ended;
     Object.assign(state, {round: news, turn: null, ended: null, names: news.names, chosen: null});
     if (!isSame) Object.assign(state, {isReady: false, vote: null});
-    state.sight = {rows: news.window_rows, columns: news.window_columns, colours: news.window_colours};
+    state.sight = {rows: news.observation_shape[1], columns: news.observation_shape[2], colours: news.window_colours};
     buildRound();
   },
   turn(news) { state.turn = news; state.chosen = null; playHeld(); },
@@ -293,7 +293,7 @@ function placeWords() {
 function showGame() {
   const {round, turn, me} = state, canvas = element("board");
   const isBoard = Boolean(turn.board);
-  fitView(canvas, isBoard ? [round.width, round.height] : [round.window_columns, round.window_rows]);
+  fitView(canvas, isBoard ? [round.width, round.height] : [state.sight.columns, state.sight.rows]);
   if (isBoard) {
     drawBoard(canvas, round, momentOf(round, turn.board), me);
   } else if (turn.window) drawWindow(canvas, state.sight, bytesOf(turn.window));
@@ -322,7 +322,8 @@ function showScores() {
   element("mine").textContent = number(turn.harvest[me]);
   const isOther = turn.income && turn.income[me] !== turn.harvest[me];
   element("mine-name").textContent = isOther ? `your apples (net ${number(turn.income[me])})` : "your apples";
-  element("stock").textContent = `${number(turn.stock)} / ${number(round.sites.length)}`;
+  element("stock").parentNode.hidden = turn.stock === null;
+  element("stock").textContent = `${number(turn.stock ?? 0)} / ${number(round.sites.length)}`;
   element("left").textContent = pace ? seconds(Math.ceil(left / pace)) : number(left);
   element("left-name").textContent = pace ? "left" : "turns left";
   element("time").max = round.episode_steps;
@@ -330,7 +331,7 @@ function showScores() {
   element("in-force").textContent = turn.rule_in_force ? `In force: ${turn.rule_in_force}` : "";
   state.items.forEach(({item, words}, agent) => {
     const income = turn.income && turn.income[agent] !== turn.harvest[agent] ? ` (${number(turn.income[agent])})` : "";
-    words.textContent = `${number(turn.harvest[agent])}${income}`;
+    words.textContent = turn.harvest[agent] === null ? "" : `${number(turn.harvest[agent])}${income}`;
     item.classList.toggle("out", Boolean(turn.board) && !(turn.board.poses[agent] & IN_PLAY));
   });
 }
