@@ -42,10 +42,10 @@ def test_every_logged_name_has_its_line_in_the_docs_and_the_other_way_round(tmp_
     elsewhere = {
         "evaluation/greedy_return",
         *("random_play/<metric>", "evaluation/<metric>", "evaluation/return"),
-        *("agent_<i>/harvested", "turn/stock", "windows/frames", "world/marks"),
+        *("agent_<i>/harvested", "turn/stock", "turn/rule", "windows/frames", "world/marks"),
         *("wall/boards", "wall/labels", "income", "joint_actions", "random_play/income"),
         *("decisions", "decisions/labels"),
-        *(name for name in told if name.startswith("institutions/")),
+        *(name for name in told if name.startswith(("institutions/", "governor/"))),
         *(f"agent_<i>/{name}" for name in (*AGENT_TOTALS, "paid", "given")),
         *("world/regions", "world/violators", "social/income_equality"),
     }
@@ -72,7 +72,7 @@ def rows_under(heading):
         (
             "Institutions",
             "",
-            [name for name in METRICS if name.startswith("institutions/")],
+            [name for name in METRICS if name.startswith(("institutions/", "governor/"))],
             ["institutions/in_force_<v>", *(f"agent_<i>/{name}" for name in AGENT_TOTALS)],
         ),
     ],

@@ -6,12 +6,14 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 import torch
+from recordings import column
 from same_runs import differences
 from tiny_study import GAME, LEARNING, TINY
 
 import cprl
 from cprl import keys
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
+from cprl.evaluation.film import film
 from cprl.evaluation.populations import play_population
 from cprl.institutions import Governor, Quota, Tax
 from cprl.policies.governors import Constant, StockRule
@@ -213,3 +215,13 @@ def test_a_governor_of_a_quota_opens_and_closes_the_harvest():
         return float(torch.stack(harvests).sum())
 
     assert harvest_under(0.0) == 0 < harvest_under(1000.0)
+
+
+@pytest.mark.integration
+def test_a_film_draws_the_number_in_force_under_the_stock(tmp_path):
+    run = cprl.run(replace(EXPERIMENT, governor=StockRule()), tmp_path / "run", **QUIET)
+    path, _ = film(run, tmp_path / "film.rrd", episode=0)
+    drawn, rates = column(path, "turn/rule", "Scalars:scalars")
+    times, _ = column(path, "turn/stock", "Scalars:scalars")
+    assert drawn == times
+    assert {*np.ravel(rates)} <= {*GOVERNOR.options}

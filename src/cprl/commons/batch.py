@@ -15,7 +15,7 @@ from cprl.institutions import Law
 from cprl.institutions.arrays import state_arrays
 from cprl.institutions.law import new_law
 from cprl.institutions.ledger import VIOLATIONS
-from cprl.values import Range, Seed, checked
+from cprl.values import Range, Seed, checked, refusal
 from cprl.values.array_types import Bool, Float32, Int64, UInt8
 
 
@@ -169,13 +169,13 @@ class Batch:
 
     def put_in_force(self, rule: Int64) -> None:
         """Put an option of the governor in force in each world from the coming turn on; `rule`: int64 [B]."""
-        governor = self.game.governor
-        if governor is None or rule.shape != (self.size,) or not _are_indices(rule, len(governor.options)):
-            allowed = "no rule" if governor is None else f"[{self.size}] of 0 to {len(governor.options) - 1}"
-            raise ValueError(f"rule is {rule.dtype} {list(rule.shape)}; allowed: {allowed}")
+        assert self.game.governor is not None
         assert self.law is not None
+        options = np.array(self.game.governor.options)
+        if rule.min() < 0 or rule.max() >= len(options):
+            raise refusal("rule", rule, f"indices of the {len(options)} options")
         in_force = self.driver.read(self.law.ledger.in_force)
-        in_force[:, -1] = np.array(governor.options)[rule]
+        in_force[:, -1] = options[rule]
         self.driver.write(self.law.ledger.in_force, in_force)
 
     def seen(self) -> Float32:
@@ -262,8 +262,3 @@ class Batch:
             raise ValueError(
                 f"{noun} {choice} of agent {agent} in world {world} is unknown; allowed: {allowed}"
             )
-
-
-def _are_indices(values: Int64, known: int) -> bool:
-    """Return whether all values are in 0 .. known - 1."""
-    return bool((values >= 0).all() and (values < known).all())

@@ -313,12 +313,7 @@ def _check_agents(experiment: Experiment, schedule: Schedule) -> None:
             check_reward(f"{where}.reward", spec.reward, experiment.game.agents)
         if isinstance(spec, Team) and isinstance(spec.algorithm, TeamAlgorithm):
             spec.algorithm.check_team(len(spec.agents), spec.reward)
-        settings: Any = getattr(getattr(spec, "algorithm", None), "settings", None)
-        if hasattr(settings, "refuse_worlds"):
-            try:
-                settings.refuse_worlds(schedule.worlds)
-            except ValueError as error:
-                raise ValueError(f"{where}.algorithm.settings: {error}") from error
+        settings = _check_settings(where, spec, schedule.worlds)
         rollout_steps = getattr(settings, "rollout_steps", schedule.update_every)
         schedule.refuse_rollouts(rollout_steps, f"{where}.algorithm.settings.rollout_steps")
 
@@ -332,22 +327,27 @@ def _check_governor(experiment: Experiment) -> None:
                 "governor: 0"
             )
         return
-    for index, game in enumerate([experiment.game, *(part.game for part in experiment.earlier)]):
-        if not isinstance(game, Game) or game.governor is None:
-            which = f"experiment.earlier[{index - 1}].game" if index else "experiment.game"
-            raise ValueError(f"experiment.governor is {spec}; allowed in {which} without a Governor: None")
-        if isinstance(spec, Script):
-            spec.check(game.governor)
+    game = experiment.game
+    if not isinstance(game, Game) or game.governor is None:
+        raise ValueError(f"experiment.governor is {spec}; allowed in a game without a Governor: None")
+    if isinstance(spec, Script):
+        spec.check(game.governor)
     if isinstance(spec, Learning) and spec != Learning(spec.algorithm):
         raise ValueError(f"experiment.governor is {spec}; allowed for a governor: Learning(algorithm) alone")
     if isinstance(spec, Frozen):
         _check_stored("experiment.governor", spec, experiment.replicas)
+    _check_settings("experiment.governor", spec, experiment.worlds)
+
+
+def _check_settings(where: str, spec: Any, worlds: int) -> Any:
+    """Return the settings of an agent's algorithm, or None; refuse those that do not fit the worlds."""
     settings: Any = getattr(getattr(spec, "algorithm", None), "settings", None)
     if hasattr(settings, "refuse_worlds"):
         try:
-            settings.refuse_worlds(experiment.worlds)
+            settings.refuse_worlds(worlds)
         except ValueError as error:
-            raise ValueError(f"experiment.governor.algorithm.settings: {error}") from error
+            raise ValueError(f"{where}.algorithm.settings: {error}") from error
+    return settings
 
 
 def _check_stored(where: str, stored: Frozen, replicas: int) -> None:

@@ -79,8 +79,8 @@ class Governor(Institution):
         governed = self.governed(game)
         if governed is None:
             raise ValueError(
-                f'Governor.sets is "{self.sets}"; allowed: a number of an institution of the game that no '
-                f"agent votes on, here {[name for name, kind in SETS.items() if _has(game, kind)]}"
+                f'Governor.sets is "{self.sets}"; allowed: a number of an institution of the game, on which '
+                "no agent votes"
             )
         if isinstance(governed, Tax) and (governed.brackets or self.options[-1] > 1):
             raise ValueError(
@@ -115,8 +115,3 @@ class Governor(Institution):
             "time": steps / clock,
         }
         return np.stack([sights[name] for name in self.sees], 1).astype(np.float32)
-
-
-def _has(game: Any, kind: type[Institution]) -> bool:
-    """Return whether a game has an institution of a kind that no agent votes on."""
-    return any(type(institution) is kind for institution in game.institutions)

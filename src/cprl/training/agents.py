@@ -188,8 +188,8 @@ class Population:
         """Return the governor, which counts as the agent after the last one; None without one."""
         if spec is None:
             return None
-        if self._game is None or self._game.governor is None:
-            raise ValueError(f"governor is {spec}; allowed in a game without a Governor: None")
+        assert self._game is not None
+        assert self._game.governor is not None
         lanes = Lanes(
             governor_spaces(self._game),
             agents=(self._game.agents,),

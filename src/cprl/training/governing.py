@@ -22,7 +22,7 @@ from cprl.policies.rng import Purpose, lane_name
 from cprl.population import Frozen, GovernorSpec, Learning
 from cprl.training.stored import StoredAgent, load, stored_governor, trained_agent
 from cprl.values import instantiate
-from cprl.values.array_types import AnyArray, Float64
+from cprl.values.array_types import AnyArray
 
 
 class Governing:
@@ -66,13 +66,9 @@ class Governing:
         else:
             self._stored = self._load(spec, weights or {})
             self.actor = self._stored_actor(Purpose.EXPLORATION, lanes.worlds, from_turn)
-        self._income: AnyArray = np.zeros((0, game.agents))
-        """The incomes of the turns of this period that count, [B, N]; [0, N] before the first turn."""
-        self._last: dict[str, AnyArray] = {}
-        """By name, at the last turn that counts: "seen" [B, S], "stock", "steps", "done" and "terminated"
-        [B]."""
-        self._reward: Float64 = np.zeros(0)
-        """The rewards of the last period, [B]."""
+        self._period: dict[str, AnyArray] = {}
+        """Of the turns of this period that count, by name: "income" [B, N] and "steps" [B], their sums;
+        "seen" [B, S], "stock", "done" and "terminated" [B], at the last of them. Empty before the first."""
         self._loss = torch.full((0, 1), float("nan"))
         """The loss of the last update of each replica, [R, 1]; [0, 1] before the first."""
 
@@ -80,53 +76,42 @@ class Governing:
         """Count a turn; at the end of a period store its transitions and learn."""
         if self.actor.seen is None:
             return
-        if not self._last:
-            self._begin(len(turn.next_world[keys.DONE]))
-        counts = ~self._last["done"]
-        paid = [_array(turn.next_agents[name]) for name in ("harvest", "fines", "transfers")]
-        self._income[counts] += incomes_of(*paid)[counts]
-        self._last["steps"] += counts
         entries = {
             "seen": turn.next_world[keys.SEEN],
-            "stock": turn.next_world[keys.STOCK][:, 0],
-            "done": turn.next_world[keys.DONE][:, 0],
-            "terminated": turn.next_world[keys.TERMINATED][:, 0],
+            **{name: turn.next_world[name][:, 0] for name in (keys.STOCK, keys.DONE, keys.TERMINATED)},
+            **{name: turn.next_agents[name] for name in ("harvest", "fines", "transfers")},
         }
-        for name, entry in entries.items():
-            self._last[name][counts] = _array(entry)[counts]
+        now = {name: torch.as_tensor(entry).clone().numpy(force=True) for name, entry in entries.items()}
+        now["income"] = incomes_of(now.pop("harvest"), now.pop("fines"), now.pop("transfers"))
+        now["steps"] = np.ones(len(now["income"]), np.int64)
+        if self._period:
+            for name in ("income", "steps"):
+                now[name] += self._period[name]
+            ended = self._period[keys.DONE]
+            for name, entry in now.items():
+                entry[ended] = self._period[name][ended]
+        self._period = now
         if self.actor.turns % self._governor.every_steps == 0:
             self._end_period()
 
-    def _begin(self, worlds: int) -> None:
-        """Begin a period of B worlds."""
-        self._income = np.zeros((worlds, self._game.agents))
-        self._last = {
-            "seen": np.zeros((worlds, len(self._governor.sees)), np.float32),
-            "stock": np.zeros(worlds, np.int64),
-            "steps": np.zeros(worlds, np.int64),
-            "done": np.zeros(worlds, np.bool_),
-            "terminated": np.zeros(worlds, np.bool_),
-        }
-
     def _end_period(self) -> None:
-        """Compute the rewards of a period, learn from it, and forget it."""
-        last = self._last
-        stock = last["stock"] / len(self._game.map.sites)
-        self._reward = welfare(self._governor, self._income, last["steps"], stock)
+        """Learn from a period, and forget it."""
         if self.learner is not None:
             batch = self._transitions()
             self.learner.store(batch)
             loss = self.learner.update()
             self.learner.end_episode(batch["next", keys.DONE][:, 0])
             self._loss = self._loss if loss is None else loss.cpu()
-        self._last = {}
+        self._period = {}
 
     def _transitions(self) -> TensorDict:
         """Return the period as a turn of agents of which the last is the governor."""
         assert self.actor.seen is not None
         assert self.actor.rule is not None
-        last = {name: torch.as_tensor(array) for name, array in self._last.items()}
-        reward = torch.as_tensor(self._reward, dtype=torch.float32)[:, None]
+        stock = self._period["stock"] / len(self._game.map.sites)
+        wanted = welfare(self._governor, self._period["income"], self._period["steps"], stock)
+        reward = torch.as_tensor(wanted, dtype=torch.float32)[:, None]
+        last = {name: torch.as_tensor(array) for name, array in self._period.items()}
         size = [len(reward)]
         after = {
             keys.AGENTS: TensorDict(
@@ -144,16 +129,12 @@ class Governing:
         """Return an entry of worlds, [B, ...], as that of N + 1 agents, [B, N + 1, ...]."""
         return entry[:, None].expand(-1, self._game.agents + 1, *entry.shape[1:])
 
-    def numbers(self, replica: int, worlds: int) -> dict[str, float]:
-        """Return what is logged beside an episode of a replica of W worlds: the mean reward of its last
-        period, and how the governor learns."""
-        numbers = {}
-        if len(self._reward):
-            numbers["governor/reward"] = float(self._reward[replica * worlds : (replica + 1) * worlds].mean())
-        if self.learner is not None:
-            numbers["governor/loss"] = float(self._loss[replica]) if len(self._loss) else float("nan")
-            numbers["governor/epsilon"] = self.learner.actor.epsilon
-        return numbers
+    def numbers(self, replica: int) -> dict[str, float]:
+        """Return what is logged beside an episode of a replica: how its governor learns."""
+        if self.learner is None:
+            return {}
+        loss = float(self._loss[replica]) if len(self._loss) else float("nan")
+        return {"governor/loss": loss, "governor/epsilon": self.learner.actor.epsilon}
 
     def networks(self) -> dict[str, nn.Module]:
         """Return copies of its networks, by "replica_0/agent_N" and so on; none if it does not learn."""
@@ -207,9 +188,7 @@ class Governing:
         return {
             "actor": self.actor.state_dict(),
             "learner": None if self.learner is None else self.learner.state_dict(),
-            "income": torch.tensor(self._income),
-            "last": {name: torch.tensor(array) for name, array in self._last.items()},
-            "reward": torch.tensor(self._reward),
+            "period": {name: torch.tensor(array) for name, array in self._period.items()},
             "loss": self._loss,
         }
 
@@ -217,12 +196,5 @@ class Governing:
         self.actor.load_state_dict(state["actor"])
         if self.learner is not None:
             self.learner.load_state_dict(state["learner"])
-        self._income = state["income"].numpy().copy()
-        self._last = {name: tensor.numpy().copy() for name, tensor in state["last"].items()}
-        self._reward = state["reward"].numpy().copy()
+        self._period = {name: tensor.numpy().copy() for name, tensor in state["period"].items()}
         self._loss = state["loss"].clone()
-
-
-def _array(entry: Any) -> AnyArray:
-    """Return an entry of a turn as a numpy array."""
-    return entry.numpy(force=True) if isinstance(entry, Tensor) else entry

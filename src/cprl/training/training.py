@@ -323,7 +323,7 @@ class Training:
             learner.end_episode(has_ended)
         if self.governor is not None:
             for world, numbers in zip(worlds, learned, strict=True):
-                numbers |= self.governor.numbers(world // self.schedule.worlds, self.schedule.worlds)
+                numbers |= self.governor.numbers(world // self.schedule.worlds)
         return learned
 
     def _record_episodes(self, ended: Sequence[Episode], learned: Sequence[dict[str, float]]) -> None:

@@ -193,6 +193,8 @@ def frame_columns(scene: Scene, frames: Frames) -> Columns:
     if scene.is_replay:
         stock = frames["stock"].sum(1, dtype=np.float64)
         contents["turn/stock"] = all_frames, rr.Scalars.columns(scalars=stock)
+        if "rule" in frames:
+            contents["turn/rule"] = all_frames, rr.Scalars.columns(scalars=frames["rule"])
         for agent, name in enumerate(scene.agents):
             harvested = frames["harvested"][:, agent].astype(np.float64)
             contents[f"{name}/harvested"] = all_frames, rr.Scalars.columns(scalars=harvested)

@@ -66,6 +66,8 @@ class FrameRecorder:
         frame = {"step": step, "episode": episode, "beams": board.board == BEAM, "tagged_by": self._tagged_by}
         for name in ("stock", "row", "col", "heading", "in_play", "harvested"):
             frame[name] = getattr(board, name)
+        if self._env.output.in_force.shape[1]:
+            frame["rule"] = float(self._env.output.in_force[0, -1])
         if self._has_windows:
             frame["windows"] = board.observation
         self._frames.append({name: np.array(value) for name, value in frame.items()})

@@ -121,6 +121,7 @@ def _summary_styles(curves: Curves) -> dict[str, Any]:
         f"{EVALUATION_FOLDER}/greedy_return": _line("greedy, evaluated", ORANGE),
         f"{EVALUATION_FOLDER}/return": _line("sum of all, evaluated", ORANGE),
         "turn/stock": _line("apples", PALETTE[APPLE]),
+        "turn/rule": _line("in force", PURPLE),
     }
     if curves.unit == "return":
         lines[INCOME] = _running_mean(curves.mean, ORANGE, curves.replicas)
@@ -280,13 +281,14 @@ def _replay(scene: Scene) -> Any:
             _panels(bars, "What policies say (L, R turn, B beam, S stay), taken: white", "decisions"),
             _plot("Harvest so far, apples", _entities(scene.agents, "harvested")),
             _plot("Apples on the board", ["turn/stock"]),
+            _plot("In force", ["turn/rule"] if scene.in_force else []),
             _plot("Fined (down) and given (up) in the turn, apples", payments),
         ]
     )
     left = [_board("Board", scene), rrb.Tabs(_events(), _recipe(), active_tab=0)]
     return rrb.Horizontal(
         rrb.Vertical(*left, row_shares=[7, 2]),
-        rrb.Vertical(*right, row_shares=[4, 4, 2, 2, 2][: len(right)]),
+        rrb.Vertical(*right, row_shares=[4, 4, 2, 2, 2, 2][: len(right)]),
         column_shares=[3, 2],
     )
 

@@ -355,11 +355,10 @@ class HostedRound:
         return views
 
     def in_force(self, group: int) -> list[str]:
-        """Return the title and the value in force of each ballot, after the first turn."""
-        values = self._moment[keys.IN_FORCE][group].tolist() if self.game.ballots and self.turn else []
-        return [
-            f"{ballot.title}: {value:g}" for ballot, value in zip(self.game.ballots, values, strict=False)
-        ]
+        """Return the title and the value of all that is in force by decision, after the first turn."""
+        decided = self.game.in_force
+        values = self._moment[keys.IN_FORCE][group].tolist() if decided and self.turn else []
+        return [f"{ballot.title}: {value:g}" for ballot, value in zip(decided, values, strict=False)]
 
     def in_play(self) -> Bool:
         """Return which agents can act in the coming turn, bool [G, N]."""
