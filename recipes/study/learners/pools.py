@@ -1,6 +1,6 @@
 """Is it better to learn against all of one's past selves, or against the newest? Both, cross-played.
 
-    python recipes/study/learners/pools.py studies/pools --out docs/results/learners/pools.csv
+    python recipes/study/learners/pools.py studies/pools --out docs/results/learners/pools/pools.csv
 
 On `two_complex` agent 0 learns by DQN. Agent 1 is a pool of its own past: a copy every 20,000 of 200,000
 steps, drawn anew for each episode, uniformly from the last eight or always the newest. Then agents 0 play
