@@ -68,6 +68,11 @@ class GraduatedSanctions(Institution):
         return isinstance(self.freeze_steps[0], tuple)
 
     @property
+    def is_for_tags(self) -> bool:
+        """Return whether a tag is an offence."""
+        return self.on != "violations"
+
+    @property
     def needs_tags(self) -> bool:
         return self.on == "tags"
 
@@ -110,7 +115,7 @@ def parameters(game: Any) -> dict[str, Any]:
             "steps": np.broadcast_to(levels, (game.agents, levels.shape[1])),
             "fine": sanctions.fines,
             "recovery": sanctions.recovery_steps or 0,
-            "for_tags": sanctions.on != "violations",
+            "for_tags": sanctions.is_for_tags,
             "for_violations": sanctions.on != "tags",
         }
     steps = np.zeros((game.agents, 0))

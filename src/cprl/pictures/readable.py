@@ -157,7 +157,7 @@ def _turns_missed(game: Game, sanctions: GraduatedSanctions | None) -> tuple[int
 def _sanctions_of_tags(game: Game) -> GraduatedSanctions | None:
     """Return the sanctions that replace `Rules.freeze_steps` in a game; None without any."""
     sanctions = _first(game, GraduatedSanctions)
-    return None if sanctions is None or sanctions.on == "violations" else sanctions
+    return sanctions if sanctions is not None and sanctions.is_for_tags else None
 
 
 def _first(game: Game, kind: type[Kind]) -> Kind | None:
@@ -265,7 +265,7 @@ def _sanctioner(sanctioner: Sanctioner) -> str:
 def _graduated_sanctions(sanctions: GraduatedSanctions, game: Game) -> str:
     is_broken = any(institution.can_be_broken for institution in game.institutions)
     offences = []
-    if sanctions.on != "violations" and game.rules.may_fire:
+    if sanctions.is_for_tags and game.rules.may_fire:
         offences.append("to be tagged")
     if sanctions.on != "tags" and is_broken:
         offences.append(f"a turn in which it breaks a rule{_noticed(game)}")

@@ -79,10 +79,10 @@ class Governing:
         entries = {
             "seen": turn.next_world[keys.SEEN],
             **{name: turn.next_world[name][:, 0] for name in (keys.STOCK, keys.DONE, keys.TERMINATED)},
-            **{name: turn.next_agents[name] for name in ("harvest", "fines", "transfers")},
         }
-        now = {name: torch.as_tensor(entry).clone().numpy(force=True) for name, entry in entries.items()}
-        now["income"] = incomes_of(now.pop("harvest"), now.pop("fines"), now.pop("transfers"))
+        now = {name: _copied(entry) for name, entry in entries.items()}
+        paid = [_copied(turn.next_agents[key[-1]]) for key in (keys.HARVEST, keys.FINES, keys.TRANSFERS)]
+        now["income"] = incomes_of(*paid)
         now["steps"] = np.ones(len(now["income"]), np.int64)
         if self._period:
             for name in ("income", "steps"):
@@ -198,3 +198,8 @@ class Governing:
             self.learner.load_state_dict(state["learner"])
         self._period = {name: tensor.numpy().copy() for name, tensor in state["period"].items()}
         self._loss = state["loss"].clone()
+
+
+def _copied(entry: Any) -> AnyArray:
+    """Return a copy of an entry of a turn, as a numpy array."""
+    return torch.as_tensor(entry).clone().numpy(force=True)
