@@ -14,7 +14,7 @@ A package imports only from those above it:
     policies     from observations to actions: learned, tabular and scripted agents
     learners     replay and rollouts, updates of many agents at once
     algorithms   what agents learn by: DQN, PPO, QMIX and so on, frozen values
-    population   how each agent is specified: Learning, Team, Scripted, Language, Frozen, Person
+    population   how each agent is specified: Learning, Team, Scripted, Language, Frozen, Pool, Person
     measuring    social metrics, episodes, outcomes, statistics
     runs         what is kept of a run: recipe, table of episodes, checkpoints, weights
     experiment   Experiment: what is trained and how, a value; presets: what was published, by name

@@ -1,5 +1,5 @@
-"""Specifications of agents: `Learning`, `Team`, `Scripted`, `Language`, `Frozen` and `Person`, the values
-that an experiment's `agents` holds.
+"""Specifications of agents: `Learning`, `Team`, `Scripted`, `Language`, `Frozen`, `Pool` and `Person`, the
+values that an experiment's `agents` holds.
 
 A population is a sequence of specifications. A `Team` stands once and names its agents; the other
 specifications stand for one agent each and take the remaining agent indices in order.
@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from posixpath import normpath
-from typing import Annotated, Any, Final, TypeAlias
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.learners.settings import EpsilonGreedy
@@ -18,7 +18,7 @@ from cprl.policies.decisions import Bandit
 from cprl.policies.governors import Script
 from cprl.policies.language import Language as Language
 from cprl.policies.scripted import ScriptedPolicy
-from cprl.values import AgentIndices, Custom, Natural, Value, Where, checked
+from cprl.values import AgentIndices, Custom, Natural, Positive, Steps, Value, Where, checked
 
 _LONGEST_PATH_BYTES: Final = 4095
 """The longest path that Linux takes."""
@@ -153,12 +153,56 @@ class Scripted(Value):
 
 
 @dataclass(frozen=True)
+class OwnPast(Value):
+    """The past selves of an agent that learns: copies of its network. The first is the one it starts with.
+
+    Args:
+        agent: the index of the agent in the game.
+        every_steps: steps of a replica from one copy to the next.
+        kept: the newest copies that are in the pool. Memory and the time to act grow with them.
+    """
+
+    agent: Natural
+    every_steps: Steps = 20_000
+    kept: Positive = 8
+
+
+Draw: TypeAlias = Literal["uniform", "newest"]
+
+
+@dataclass(frozen=True)
+class Pool(Value):
+    """An opponent that is drawn anew for each episode, from agents of earlier runs and past selves of an
+    agent that learns here. It learns nothing.
+
+    Each world draws for itself when its episode begins, independently of other worlds, replicas and pools.
+    A past self plays in its own replica. It is deleted `every_steps` steps after it has left the pool; an
+    episode that it still plays then draws again. In games with ballots a pool votes at random.
+
+    Args:
+        runs: the agents of earlier runs.
+        own_past: the agent whose past selves are drawn; None for no agent.
+        draw: "uniform": all are equally likely; "newest": the newest past self, or without past selves the
+            last of `runs`.
+    """
+
+    runs: tuple[Frozen, ...] = ()
+    own_past: OwnPast | None = None
+    draw: Draw = "uniform"
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.runs and self.own_past is None:
+            raise ValueError("Pool.runs is (); allowed without own_past: at least one Frozen")
+
+
+@dataclass(frozen=True)
 class Person(Value):
     """A person, who decides in a hosted game, see `cprl.web`. A run with people has the episodes that they
     played; it cannot be trained, nor its people played again."""
 
 
-AgentSpec: TypeAlias = Learning | Team | Scripted | Language | Frozen | Person
+AgentSpec: TypeAlias = Learning | Team | Scripted | Language | Frozen | Pool | Person
 """The specification of an agent, or of a team."""
 GovernorSpec: TypeAlias = Learning | Frozen | Script
 """The specification of a governor. A `Frozen` one counts as the agent after the last of its run."""
@@ -179,7 +223,7 @@ def refuse_people(specs: Sequence[AgentSpec]) -> None:
     if has_people(specs):
         raise ValueError(
             f"agents[{specs.index(Person())}] is a Person, and people play in hosted games: cprl host; "
-            "allowed: Learning, Team, Scripted, Language, Frozen"
+            "allowed: Learning, Team, Scripted, Language, Frozen, Pool"
         )
 
 
@@ -216,6 +260,8 @@ def _describe(spec: AgentSpec) -> str:
             return f"by the language model {spec.model}"
         case Frozen():
             return "of an earlier run"
+        case Pool():
+            return "of a pool"
         case Person():
             return ""
     return f"by {type(spec).__name__}"
@@ -243,6 +289,10 @@ def specs_by_agent(specs: Sequence[AgentSpec], agents: int) -> list[AgentSpec]:
             "allowed: one specification for each"
         )
     by_agent.update(zip(remaining_agents, single_specs, strict=True))
+    for agent, spec in by_agent.items():
+        own_past = getattr(spec, "own_past", None)
+        if own_past and not isinstance(by_agent.get(own_past.agent), Learning | Team):
+            raise ValueError(f"agent {agent} is a {spec}; allowed: own_past of an agent that learns")
     return [by_agent[agent] for agent in range(agents)]
 
 
@@ -297,20 +347,28 @@ def exploring(specs: Sequence[AgentSpec]) -> list[EpsilonGreedy]:
 
 
 def partners_in(specs: Iterable[Any]) -> list[str]:
-    """Return the directories of the earlier runs whose frozen agents play in a population, sorted."""
-    return sorted({spec.run for spec in specs if isinstance(spec, Frozen)})
+    """Return the directories of the earlier runs whose agents play in a population, sorted."""
+    playing = (spec for spec in specs if isinstance(spec, Frozen | Pool))
+    return sorted({stored.run for spec in playing for stored in stored_in(spec).values()})
 
 
-def stored_of(spec: Any) -> Frozen | None:
-    """Return the agent of an earlier run that a specification names, to play or to start from; None if it
-    names none."""
-    return spec if isinstance(spec, Frozen) else getattr(spec, "start_from", None)
+def stored_in(spec: Any) -> dict[str, Frozen]:
+    """Return the agents of earlier runs that a specification names, to play or to start from, each by its
+    place in the specification: "", ".start_from" or ".runs[0]" and so on."""
+    if isinstance(spec, Frozen):
+        return {"": spec}
+    if isinstance(spec, Pool):
+        return {f".runs[{index}]": stored for index, stored in enumerate(spec.runs)}
+    start = getattr(spec, "start_from", None)
+    return {} if start is None else {".start_from": start}
 
 
 def with_stored(spec: Any, change: Callable[[Frozen], Frozen]) -> Any:
-    """Return a specification after a change of the agent of an earlier run that it names, if it names one."""
+    """Return a specification after a change of the agents of earlier runs that it names."""
     if isinstance(spec, Frozen):
         return change(spec)
+    if isinstance(spec, Pool):
+        return replace(spec, runs=tuple(map(change, spec.runs)))
     if isinstance(spec, Learning | Team) and spec.start_from is not None:
         return replace(spec, start_from=change(spec.start_from))
     return spec

@@ -108,7 +108,7 @@ def test_a_model_is_shown_the_rules_and_all_that_its_agent_observes():
     system = server.requests[0]["messages"][0]["content"]
     assert system.startswith("You never lie.\nYou are one of 2 agents on a board.\nAgents pick apples.")
     assert "Each agent may pick at most" in system
-    assert '"signal": 0 to 2' in system
+    assert '"signal" is 0 to 2' in system
     assert '- "sustainable": as greedy' in system
     first, second = prompts(server)[0], prompts(server)[-1]
     assert "Of all places for apples 100% have one." in first

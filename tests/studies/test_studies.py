@@ -17,7 +17,7 @@ from cprl.experiment.experiment import MOST_SEED, Experiment
 from cprl.institutions import Quota, Sanctioner
 from cprl.learners.settings import RolloutSettings
 from cprl.networks import MLP
-from cprl.population import Frozen, Learning, Scripted, Team, stored_of
+from cprl.population import Frozen, Learning, Pool, Scripted, Team, stored_in
 from cprl.studies import Integers, LogUniform, Uniform
 from cprl.studies.factors import draw_combinations, factors_of, values_at, with_changes
 from cprl.studies.study import (
@@ -42,6 +42,12 @@ NAN = float("nan")
 
 def checksums(study):
     return [condition.checksum for condition in study.all_conditions]
+
+
+def only_stored(spec):
+    """The one agent of an earlier run that a specification names."""
+    (stored,) = stored_in(spec).values()
+    return stored
 
 
 def there_and_back(study, directory=None):
@@ -188,17 +194,18 @@ def test_blocks_have_seeds_of_their_own_and_pairs_the_same_in_every_condition():
     assert {trial.name for trial in few} < {trial.name for trial in more}, "which are kept"
 
 
-@pytest.mark.parametrize("starts", [False, True])
-def test_each_block_has_the_stored_partners_of_its_own_replicas(starts):
+@pytest.mark.parametrize("way", ["plays", "starts", "pool"])
+def test_each_block_has_the_stored_partners_of_its_own_replicas(way):
     def playing(replica, replicas=5):
         stored = Frozen("runs/a", 1, replica=replica)
-        second = replace(LEARNING, start_from=stored) if starts else stored
+        starts = replace(LEARNING, start_from=stored)
+        second = {"plays": stored, "starts": starts, "pool": Pool(runs=(stored,))}[way]
         return replace(TINY, agents=(LEARNING, second), replicas=replicas)
 
     def partners(study):
         """The stored replica of the second agent in each replica of a study."""
         return [
-            stored_of(trial.experiment.agents[1]).replica_for(replica)
+            only_stored(trial.experiment.agents[1]).replica_for(replica)
             for trial in trials_of(study)
             for replica in range(trial.block.replicas)
         ]
@@ -313,12 +320,15 @@ def test_a_run_of_a_frozen_agent_is_the_same_however_its_path_is_written():
         assert checksums(there_and_back(other, directory="studies/x")) == checksums(plain)
 
 
-@pytest.mark.parametrize("starts", [False, True])
-def test_runs_are_kept_relative_to_the_study_and_other_texts_as_they_are(tmp_path, monkeypatch, starts):
+@pytest.mark.parametrize("way", ["plays", "starts", "pool"])
+def test_runs_are_kept_relative_to_the_study_and_other_texts_as_they_are(tmp_path, monkeypatch, way):
     (tmp_path / "sub").mkdir()
-    stored, second, path = Frozen("runs/a", 0), Frozen("runs/a", 0), "agents.1.run"
-    if starts:
-        second, path = replace(LEARNING, start_from=stored), "agents.1.start_from.run"
+    stored = Frozen("runs/a", 0)
+    second, path = {
+        "plays": (stored, "agents.1.run"),
+        "starts": (replace(LEARNING, start_from=stored), "agents.1.start_from.run"),
+        "pool": (Pool(runs=(stored,)), "agents.1.runs.0.run"),
+    }[way]
     fatigue = Custom("own_parts:Fatigue", arguments={"run": "runs/a"})
     experiment = replace(TINY, agents=(LEARNING, second), transforms=(fatigue,))
     allow = ["own_parts:Fatigue"]
@@ -342,7 +352,7 @@ def test_runs_are_kept_relative_to_the_study_and_other_texts_as_they_are(tmp_pat
         if study.reference is None:
             elsewhere = Study.from_config(table, directory="../studies/x")
             there, here = (each.all_conditions[1].experiment for each in (elsewhere, study))
-            assert stored_of(there.agents[1]).run == f"../{stored_of(here.agents[1]).run}"
+            assert only_stored(there.agents[1]).run == f"../{only_stored(here.agents[1]).run}"
             assert there.transforms == here.transforms
 
 

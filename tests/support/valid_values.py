@@ -20,6 +20,8 @@ REQUIRED = {
     "Team": lambda: population.Team(algorithms.VDN(settings=algorithms.DQNSettings()), agents=(0, 1)),
     "Language": lambda: population.Language(model="small"),
     "Frozen": lambda: population.Frozen("runs/none", agent=0),
+    "OwnPast": lambda: population.OwnPast(agent=0),
+    "Pool": lambda: population.Pool(runs=(population.Frozen("runs/none", agent=0),)),
     "RandomEnd": lambda: cprl.RandomEnd(prob=0.15),
     "InequityAversion": lambda: rewards.InequityAversion(alpha=5, beta=0.05, smoothing=0.9),
     "SocialValueOrientation": lambda: rewards.SocialValueOrientation(angle=0.5, weight=1.0),

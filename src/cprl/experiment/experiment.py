@@ -25,7 +25,7 @@ from cprl.population import (
     learned,
     refuse_undecided,
     specs_by_agent,
-    stored_of,
+    stored_in,
 )
 from cprl.runs.files import RECIPE_FORMAT, written_by_another
 from cprl.runs.length import Length
@@ -307,10 +307,8 @@ def _check_agents(experiment: Experiment, schedule: Schedule) -> None:
             raise ValueError(f"experiment.agents: {error}") from error
     for index, spec in enumerate(experiment.agents):
         where = f"experiment.agents[{index}]"
-        stored = stored_of(spec)
-        if stored is not None:
-            field = where if stored is spec else f"{where}.start_from"
-            _check_stored(field, stored, experiment.replicas)
+        for place, stored in stored_in(spec).items():
+            _check_stored(f"{where}{place}", stored, experiment.replicas)
         if isinstance(spec, Learning | Team) and not isinstance(experiment.game, Custom):
             check_reward(f"{where}.reward", spec.reward, experiment.game.agents)
         if isinstance(spec, Team) and isinstance(spec.algorithm, TeamAlgorithm):

@@ -18,6 +18,7 @@ Modules, in the order in which one reads them:
     ray_executor    Ray: runs the trials of a study on the machines of a cluster
     current_policy  CurrentPolicy: the first replica's agents of a training as they are now
     exhibition      a world that the current policy plays, for viewers alone
+    lawgiver        Lawgiver: a language model that gives institutions between episodes
     export_turns    fresh episodes for other programs, turn by turn: CSV, Minari
     commands        cprl egta, exploit, schelling, search and visits
 """

@@ -95,7 +95,7 @@ class JointPolicy(TensorDictModuleBase):
             _Assignment.from_actor(actor, agents) for agents, actor in actors_by_agents.items()
         ]
         self._one_actor_plays_all = self.indices == [tuple(controlled)]
-        self._state_cells = max(assignment.state_cells for assignment in self._assignments)
+        self.state_cells = max(assignment.state_cells for assignment in self._assignments)
         """The numbers in the largest recurrent state of an agent; 0 if no actor is recurrent."""
         self._worlds = max(assignment.worlds for assignment in self._assignments)
         """The worlds that all replicas play together; 0 if actors play any number."""
@@ -123,8 +123,8 @@ class JointPolicy(TensorDictModuleBase):
         observation = keys.entry(agents, "observation")
         self._refuse_other_agents(observation.shape[batch_dims])
         shape = observation.shape[: batch_dims + 1]
-        if self._state_cells:
-            recurrent_state.prepare(agents, (*shape, self._state_cells), observation.device)
+        if self.state_cells:
+            recurrent_state.prepare(agents, (*shape, self.state_cells), observation.device)
         if self._one_actor_plays_all:  # reads and writes whole entries, without indexing or copying them
             (assignment,) = self._assignments
             keys.put(agents, "action", _choose(assignment, agents, (), tensordict))

@@ -85,15 +85,16 @@ class _BoardPlans:
         """Return what a model has to know before it answers."""
         rules = self.game.rules
         policies = [f'- "{policy}": {behaviour}' for policy, behaviour in BEHAVIOURS.items()]
-        signals = f', "signal": 0 to {rules.signals}, which others see' * bool(rules.signals)
+        signal = f'"signal" is 0 to {rules.signals}, which others see.' * bool(rules.signals)
         return "\n".join(
             [
                 f"You are one of {self.game.agents} agents on a board.",
                 *instructions_of(self.game, "window"),
                 "Each apple that you pick is a point for you.",
                 f"Every {spec.every_steps} turns you choose a plan, which is played for you. Answer with one",
-                "JSON object and nothing else:",
-                f'{{"why": "a short reason", "policy": a name of the list, "spare": 1 to 8{signals}}}',
+                "JSON object and nothing else, in this form:",
+                '{"why": "...", "policy": "...", "spare": 3' + ', "signal": 0' * bool(rules.signals) + "}",
+                f'"why" is a short reason, "policy" a name of the list, "spare" 1 to 8. {signal}'.rstrip(),
                 *policies,
             ]
         )
@@ -174,7 +175,7 @@ class _PlainActions:
         every = "each turn" if spec.every_steps == 1 else f"every {spec.every_steps} turns"
         return (
             f"You choose an action {every}. Answer with one JSON object and nothing else:\n"
-            f'{{"why": "a short reason", "action": an integer from 0 to {last}}}'
+            f'{{"why": "...", "action": 0}}\n"why" is a short reason, "action" an integer from 0 to {last}.'
         )
 
     def seen(self, observation: AnyArray, memory: Float32) -> str:

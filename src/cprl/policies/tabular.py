@@ -151,6 +151,9 @@ class TableNetwork(nn.Module):
         for name in ("states", "values"):
             buffer = getattr(self, name)
             stored = state_dict.get(prefix + name)
+            if stored is not None and len(stored) == 0:  # a table without states knows no size of one
+                stored = buffer[:0]
+                state_dict[prefix + name] = stored
             if stored is not None and stored.shape[1:] == buffer.shape[1:]:
                 setattr(self, name, buffer.new_zeros(stored.shape))
         super()._load_from_state_dict(state_dict, prefix, *options)

@@ -212,7 +212,7 @@ def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") ->
     return dict(recipe["experiment"])
 
 
-STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)\.((start_from\.)?run|stored)")
+STORED_RUN: Final = re.compile(r"agents\.(\*|\d+)\.((start_from\.|runs\.\d+\.)?run|stored)")
 """The path of a study's factor that is a run."""
 _RUN_FIELDS: Final = {"Frozen": {"run"}, "Language": {"stored"}}
 """The fields that hold the path of a run, by kind."""

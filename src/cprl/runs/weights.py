@@ -144,6 +144,8 @@ def _weights_in_checkpoint(checkpoint: Path) -> StoredWeights:
     networks: dict[str, Any] = {}
     for learner in state["learners"]:
         networks.update(learner["networks"])
+    for other in state["others"]:
+        networks.update(other.get("_extra_state", {}).get("networks", {}))
     decisions: Mapping[str, Any] = next(iter(state.get("decisions", ())), {})
     return StoredWeights(
         path=checkpoint,

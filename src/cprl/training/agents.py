@@ -27,7 +27,7 @@ from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_
 from cprl.policies.governors import governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
-from cprl.policies.rng import Purpose, lane_name, lane_seeds
+from cprl.policies.rng import Purpose, lane_name, lane_names, lane_seeds
 from cprl.policies.scripted import RULES_READ, ScriptedActor
 from cprl.population import (
     AgentSpec,
@@ -35,6 +35,7 @@ from cprl.population import (
     GovernorSpec,
     Language,
     Learning,
+    Pool,
     Scripted,
     Team,
     grouped,
@@ -46,6 +47,7 @@ from cprl.population import (
 from cprl.training.governing import Governing
 from cprl.training.stored import (
     LoadedRun,
+    PoolActor,
     StoredAgent,
     decision_values,
     language_agent,
@@ -118,13 +120,15 @@ class Population:
         self._replica_numbers = range(first_replica, first_replica + self.replicas)
         self.calls = Calls()
         """The calls of the agents' language models."""
-        self._stored_agents = self._load_stored_agents(weights or {})
         self.learners: dict[tuple[int, ...], AnyLearner] = {}
         for spec, agents in groups:
             if isinstance(spec, Learning | Team):
                 _refuse_only_in_play(spec, env)
                 self.learners[agents] = self._make_learner(spec, agents, engine, starts)
+        self._pools: dict[int, PoolActor] = {}
+        self._stored_agents = self._load_stored_agents(weights or {})
         self.others: dict[ActorAgents, nn.Module] = self.other_actors(Purpose.EXPLORATION, worlds=worlds)
+        self.others |= {(agent,): pool for agent, pool in self._pools.items()}
         self.decisions: BanditDecider | None = self._make_decider()
         """The decisions of the agents on the game's ballots, and how they learn them; None without
         ballots."""
@@ -169,10 +173,13 @@ class Population:
         return JointPolicy(actors, decisions=decisions, governor=governor)
 
     def networks(self) -> dict[str, nn.Module]:
-        """Return copies of the learners' current acting networks, by "replica_0/agent_0" and so on."""
+        """Return copies of the learners' current acting networks, by "replica_0/agent_0" and so on, and the
+        networks of past selves, see `PoolActor.networks`."""
         networks: dict[str, nn.Module] = {}
         for learner in self.learners.values():
             networks |= learner.networks()
+        for pool in self._pools.values():
+            networks |= pool.networks()
         return networks if self.governor is None else networks | self.governor.networks()
 
     def _make_governor(
@@ -198,20 +205,30 @@ class Population:
         """Return copies of the current agents of some replicas, by agent and replica."""
         networks = self.networks()
         decisions = {} if self.decisions is None else self.decisions.learned()
+        others = self._others_as_stored()
         agents: list[list[StoredAgent]] = []
         for agent, spec in enumerate(self._specs_by_agent):
             if isinstance(spec, Learning | Team):
                 lanes = [lane_name(replica, agent) for replica in replicas]
                 agents.append([trained_agent(spec, networks[lane], decisions.get(lane)) for lane in lanes])
             else:
-                agents.append(
-                    [self._stored_agents[agent][self._replica_numbers.index(replica)] for replica in replicas]
-                )
+                agents.append([others[agent][self._replica_numbers.index(replica)] for replica in replicas])
         return agents
 
     def _load_stored_agents(self, weights: Mapping[str, str]) -> dict[int, list[StoredAgent]]:
-        """Return the scripted and frozen agents of each replica by index; each stored run is read once."""
+        """Make the pools; return the scripted and frozen agents of each replica by index. Each stored run is
+        read once."""
         runs: dict[str, LoadedRun] = {}
+
+        def frozen(spec: Frozen) -> list[StoredAgent]:
+            if spec.run not in runs:
+                runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
+                _refuse_other_game(runs[spec.run], self.spaces, self._game, is_to_decide=True)
+            replicas = map(spec.replica_for, self._replica_numbers)
+            stored = [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
+            return [replace(one, calls=self.calls) for one in stored]
+
+        seeds = partial(lane_seeds, self.seed, replicas=self._replica_numbers, purpose=Purpose.EXPLORATION)
         agents: dict[int, list[StoredAgent]] = {}
         for agent, spec in enumerate(self._specs_by_agent):
             if isinstance(spec, Scripted):
@@ -219,13 +236,31 @@ class Population:
             elif isinstance(spec, Language):
                 agents[agent] = [language_agent(spec, self.calls)] * self.replicas
             elif isinstance(spec, Frozen):
-                if spec.run not in runs:
-                    runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
-                    _refuse_other_game(runs[spec.run], self.spaces, self._game, is_to_decide=True)
-                replicas = map(spec.replica_for, self._replica_numbers)
-                stored = [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
-                agents[agent] = [replace(one, calls=self.calls) for one in stored]
+                agents[agent] = frozen(spec)
+            elif isinstance(spec, Pool):
+                self._pools[agent] = PoolActor(
+                    list(map(frozen, spec.runs)),
+                    self.playing,
+                    seeds=seeds(agents=[agent]),
+                    worlds=self.worlds,
+                    draw=spec.draw,
+                    own_past=spec.own_past,
+                    present=partial(self._present, spec.own_past),
+                )
         return agents
+
+    def _present(self, own_past: Any) -> list[StoredAgent]:
+        """Return copies of the agent of an `OwnPast` as it is now, of each replica."""
+        agent = own_past.agent
+        spec: Any = self._specs_by_agent[agent]
+        (learner,) = (learner for agents, learner in self.learners.items() if agent in agents)
+        networks = learner.networks()
+        names = lane_names(replicas=self._replica_numbers, agents=[agent])
+        return [trained_agent(spec, networks[name], None) for name in names]
+
+    def _others_as_stored(self) -> dict[int, list[StoredAgent]]:
+        """Return the agents of each replica that do not learn by index, pools as they are now."""
+        return self._stored_agents | {agent: pool.as_stored() for agent, pool in self._pools.items()}
 
     def other_actors(
         self, purpose: Purpose, *, worlds: int, replicas: int | None = None
@@ -238,7 +273,7 @@ class Population:
             replicas: the number of replicas; by default all.
         """
         numbers = self._replica_numbers[:replicas]
-        agents = {agent: stored[: len(numbers)] for agent, stored in self._stored_agents.items()}
+        agents = {agent: stored[: len(numbers)] for agent, stored in self._others_as_stored().items()}
         if purpose is Purpose.EXHIBITION:  # viewers cost no calls
             agents = {agent: list(map(_without_language, stored)) for agent, stored in agents.items()}
         kinds = {

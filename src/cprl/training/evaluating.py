@@ -68,7 +68,8 @@ def make_earlier(experiment: Experiment, env: EnvBase, population: Population) -
     for index, part in enumerate(experiment.earlier):
         earlier = make_worlds(experiment, env.batch_size.numel(), game=part.game, device=experiment.device)
         name = f"experiment.earlier[{index}].game"
-        refuse_other_worlds(earlier, env, name, population.others.values())
+        actors = [part for actor in population.others.values() for part in actor.modules()]
+        refuse_other_worlds(earlier, env, name, actors)
         try_custom_metrics(experiment.metrics, earlier)
         made.append((earlier, part.steps))
     return made

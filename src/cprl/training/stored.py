@@ -10,9 +10,11 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
+from cprl import recurrent_state
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.env_state import load_transforms_state
@@ -28,15 +30,18 @@ from cprl.policies.decisions import ballot_sizes, stored_decisions
 from cprl.policies.governors import GovernorActor, Script, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
-from cprl.policies.rng import Purpose, lane_name, lane_seeds
+from cprl.policies.rng import LaneRng, Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
 from cprl.population import (
     AgentSpec,
+    Draw,
     Frozen,
     GovernorSpec,
     Language,
     Learning,
+    OwnPast,
     Person,
+    Pool,
     Scripted,
     Team,
     specs_by_agent,
@@ -45,6 +50,7 @@ from cprl.runs.checkpoints import CHECKPOINTS
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, warn_of_changes
 from cprl.runs.weights import frozen_weights_name, weights_in
+from cprl.system.compat.tensordicts import unchecked_tensordict
 from cprl.values import Custom, describe_changes, instantiate, short_repr, to_config
 
 _MOST_DIFFERENCES: Final = 3
@@ -53,10 +59,10 @@ _MOST_DIFFERENCES: Final = 3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StoredAgent:
-    """An agent that no longer learns: a scripted policy, or a network and how it acts by it."""
+    """An agent that no longer learns: a scripted policy, a network and how it acts by it, or a pool."""
 
     scripted: ScriptedPolicy | Script | None = None
-    """The policy that it follows; None for an agent that acts by a network."""
+    """The policy that it follows; None for an agent that acts by a network, or a pool."""
     language: Language | None = None
     """How a language model makes its plans, where it falls back to `scripted`; None without one."""
     calls: Calls | None = field(default=None, repr=False)
@@ -71,6 +77,10 @@ class StoredAgent:
     decisions: Tensor | None = field(default=None, repr=False)
     """The values of its choices on all ballots, float64 [C]; None if it decides at random, or has no
     ballots."""
+    pool: tuple["StoredAgent", ...] = ()
+    """The opponents, oldest first, one of which plays each episode; empty for a single agent."""
+    draw: Draw = "uniform"
+    """How it is drawn which of them plays, see `Pool`."""
 
     @property
     def kind(self) -> tuple[Any, ...]:
@@ -176,11 +186,16 @@ class LoadedRun:
                 "table, report, show and film, which read what they played"
             )
         if isinstance(spec, Frozen):
-            if spec.run not in self._earlier:
-                weights = frozen_weights_name(self.recipe, self.path, spec.run)
-                self._earlier[spec.run] = load(spec.run, weights=weights)
-            return self._earlier[spec.run].agent(spec.agent, replica=spec.replica_for(replica))
+            return self._frozen(replica, spec)
         lane = lane_name(replica, agent)
+        if isinstance(spec, Pool):
+            opponents = list(map(partial(self._frozen, replica), spec.runs))
+            if spec.own_past is not None:
+                learner: Any = self.specs[spec.own_past.agent]
+                past = [network for name, network in self.networks.items() if name.startswith(f"{lane}/")]
+                newest = past[-spec.own_past.kept :]
+                opponents += [trained_agent(learner, network, None) for network in newest]
+            return StoredAgent(pool=tuple(opponents), draw=spec.draw)
         if lane not in self.networks:
             raise ValueError(f"{self.path} keeps no network of {lane}; kept are {sorted(self.networks)}")
         if not all_finite(self.networks[lane].state_dict().values()):
@@ -188,6 +203,13 @@ class LoadedRun:
                 f"{self.weights_from}: the weights of {lane} are NaN or infinite; leave that replica out"
             )
         return trained_agent(spec, self.networks[lane], self._decisions_of(lane))
+
+    def _frozen(self, replica: int, spec: Frozen) -> StoredAgent:
+        """Return the agent of an earlier run that plays in a replica here."""
+        if spec.run not in self._earlier:
+            weights = frozen_weights_name(self.recipe, self.path, spec.run)
+            self._earlier[spec.run] = load(spec.run, weights=weights)
+        return self._earlier[spec.run].agent(spec.agent, replica=spec.replica_for(replica))
 
     def _decisions_of(self, lane: str) -> Tensor | None:
         sizes = ballot_sizes(self.game) if isinstance(self.game, Game) else ()
@@ -317,8 +339,10 @@ def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module
     try:
         for name, state in weights.items():
             lane = name if "/" in name else f"replica_0/{name}"
-            agent = int(lane.rpartition("_")[2])
+            agent = int(lane.split("/")[1].removeprefix("agent_"))
             spec = [*run.specs, *run._governor][agent]
+            if isinstance(spec, Pool) and spec.own_past is not None:
+                spec = run.specs[spec.own_past.agent]
             if not isinstance(spec, Learning | Team):
                 raise ValueError(f"{lane} is the network of an agent that does not learn")
             refusal = f"{run.path / RECIPE_FILE}: a network cannot be made"
@@ -373,13 +397,12 @@ def stored_policies(
         governor: the stored governor of each replica; empty where the first option stays in force.
     """
     by_index = dict(enumerate(agents))
-    kinds = {agent: stored[0].kind for agent, stored in by_index.items()}
     seeds = partial(lane_seeds, seed, replicas=replicas, purpose=Purpose.EVALUATION)
     decisions = None
     if isinstance(playing, Game):
         stored = decision_values(by_index)
         decisions = stored_decisions(playing, stored, replicas=replicas, worlds=worlds, seed=seed)
-    actors = stored_actors(by_index, playing, kinds=kinds, seeds=seeds, worlds=worlds, stacks=True)
+    actors = stored_actors(by_index, playing, seeds=seeds, worlds=worlds, stacks=True)
     governs = None
     if isinstance(playing, Game) and governor:
         lanes = seeds(agents=[playing.agents])
@@ -430,25 +453,37 @@ def stored_actors(
     agents: Mapping[int, Sequence[StoredAgent]],
     playing: Game | Spaces,
     *,
-    kinds: Mapping[int, Any],
+    kinds: Mapping[int, Any] | None = None,
     seeds: Callable[..., Sequence[Sequence[int]]],
     worlds: int,
     stacks: bool = False,
 ) -> dict[ActorAgents, nn.Module]:
     """Return actors for stored agents; agents of one kind are lanes of one actor: lane = replica x agents +
-    agent.
+    agent. A pool has an actor of its own.
 
     Args:
         agents: the stored agents of each replica, by index.
+        kinds: the kind of each agent by index; by default `StoredAgent.kind`.
         seeds: returns the seeds of the lanes of some `agents`.
         stacks: whether lanes with the very same network are stacked too, so that its values equal, to the
             last bit, those beside other networks.
     """
     indices_by_kind: dict[Any, list[int]] = {}
-    for agent in sorted(agents):
-        indices_by_kind.setdefault(kinds[agent], []).append(agent)
     spaces = playing.spaces if isinstance(playing, Game) else playing
     actors: dict[ActorAgents, nn.Module] = {}
+    for agent in sorted(agents):
+        replicas = agents[agent]
+        if replicas[0].pool:
+            actors[agent,] = PoolActor(
+                list(zip(*[stored.pool for stored in replicas], strict=True)),
+                playing,
+                seeds=seeds(agents=[agent]),
+                worlds=worlds,
+                draw=replicas[0].draw,
+            )
+        else:
+            kind = replicas[0].kind if kinds is None else kinds[agent]
+            indices_by_kind.setdefault(kind, []).append(agent)
     for indices in indices_by_kind.values():
         by_replica = zip(*[agents[agent] for agent in indices], strict=True)
         lanes = list(chain.from_iterable(by_replica))
@@ -485,3 +520,135 @@ def _apply_together(networks: Sequence[nn.Module], *, stacks: bool) -> Callable[
     except ValueError:  # these networks do not stack, e.g. custom ones
         return lambda seen: torch.stack([network(lane) for network, lane in zip(networks, seen, strict=True)])
     return lambda *seen: stack(*seen)
+
+
+class PoolActor(nn.Module):
+    """Plays one agent of every replica by opponents, one of which each world draws for each episode.
+
+    In each turn all opponents choose, by random numbers of their own, and the action of the drawn one counts.
+    The agent's recurrent state is the index of the drawn one plus 1, thus 0 when an episode begins, and then
+    the states of all opponents.
+
+    Args:
+        opponents: the opponents besides past selves, oldest first, each a `StoredAgent` of each replica.
+        seeds: the seed of each replica, see `lane_seeds`; opponents have continuations of it.
+        worlds: the worlds k of each replica.
+        draw: see `Pool`.
+        own_past: the past selves; None for none.
+        present: returns copies of the agent of `own_past` as it is now, a `StoredAgent` of each replica.
+    """
+
+    def __init__(
+        self,
+        opponents: Sequence[Sequence[StoredAgent]],
+        playing: Game | Spaces,
+        *,
+        seeds: Sequence[Sequence[int]],
+        worlds: int,
+        draw: Draw,
+        own_past: OwnPast | None = None,
+        present: Callable[[], Sequence[StoredAgent]] = list,
+    ) -> None:
+        super().__init__()
+        if any(stored.language for replicas in opponents for stored in replicas):
+            raise ValueError(
+                "an opponent of a Pool plays by a language model, which would be asked in episodes of others "
+                "too; allowed: agents that learned, or follow a script"
+            )
+        self.rng = LaneRng(seeds, worlds)
+        self._playing = playing
+        self._seeds = seeds
+        self._worlds = worlds
+        self._draw = draw
+        self._own_past = own_past
+        self._present = present
+        self._first_past = len(opponents)
+        # One more than can be drawn, so that the last one to leave ends its episodes.
+        self._held = own_past.kept + 1 if own_past else 0
+        self._all = [*opponents, *(present() for _ in range(self._held))]
+        self._copies = min(self._held, 1)
+        """The past selves so far; number n has the index `_first_past` + n % `_held`."""
+        self._steps = 0
+        self.policy = self._make_policy()
+        self.state_cells = 1 + len(self._all) * self.policy.state_cells
+        actors: Any = self.policy.actors
+        read = {name for actor in actors for name in actor.in_keys}
+        self.in_keys = (*read - {recurrent_state.AFTER}, recurrent_state.AFTER)
+
+    def _make_policy(self) -> JointPolicy:
+        """Return the policy that plays all opponents as the agents of one game."""
+
+        def seeds(agents: Sequence[int]) -> list[tuple[int, ...]]:
+            return [(*seed, self._copies, opponent + 1) for seed in self._seeds for opponent in agents]
+
+        opponents = dict(enumerate(self._all))
+        return JointPolicy(stored_actors(opponents, self._playing, seeds=seeds, worlds=self._worlds))
+
+    def _newest(self, count: int) -> dict[int, int]:
+        """Return the indices of the newest past selves by their numbers, oldest first."""
+        numbers = range(max(0, self._copies - count), self._copies)
+        return {number: self._first_past + number % self._held for number in numbers}
+
+    @property
+    def _drawable(self) -> list[int]:
+        return [*range(self._first_past), *self._newest(self._held - 1).values()]
+
+    def as_stored(self) -> list[StoredAgent]:
+        """Return the pool of each replica as it is now."""
+        opponents = [self._all[index] for index in self._drawable]
+        return [StoredAgent(pool=pool, draw=self._draw) for pool in zip(*opponents, strict=True)]
+
+    def networks(self) -> dict[str, nn.Module]:
+        """Return the networks of past selves, oldest first, by "replica_0/agent_1/past_0" and so on."""
+        return {
+            f"{lane_name(*seed[1:3])}/past_{number}": stored.network
+            for number, index in self._newest(self._held).items()
+            for seed, stored in zip(self._seeds, self._all[index], strict=True)
+            if stored.network is not None
+        }
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        left = self._copy_if_due()
+        batch_size = tensordict.batch_size
+        entries = {name: tensordict.get(name) for name in self.in_keys}
+        states = entries.pop(recurrent_state.AFTER)[:, 0]
+        index = self._draw_if_due(states[:, 0].long() - 1, left)[:, None]
+        size = *batch_size, len(self._all)
+        seen = {name: entry.expand(*size, *entry.shape[2:]) for name, entry in entries.items()}
+        seen[recurrent_state.AFTER] = states[:, 1:].reshape(*size, self.policy.state_cells)
+        agents = unchecked_tensordict(seen, batch_size)
+        self.policy(unchecked_tensordict({"agents": agents}, batch_size))
+        states_after = torch.cat([index + 1.0, agents.get(recurrent_state.AFTER).flatten(1)], 1)
+        tensordict.set("action", agents.get("action").gather(1, index))
+        return tensordict.set(recurrent_state.AFTER, states_after[:, None])
+
+    def _draw_if_due(self, index: Tensor, left: int) -> Tensor:
+        """Return the index of each world's opponent, int64 [B], drawn anew where it is -1 or has left."""
+        drawable = torch.tensor(self._drawable, device=index.device)
+        position = (self.rng.next().flatten() * len(drawable)).long().to(index.device)
+        drawn = drawable[position] if self._draw == "uniform" else drawable[-1]
+        return torch.where((index < 0) | (index == left), drawn, index)
+
+    def _copy_if_due(self) -> int:
+        """Copy the agent as it is now; return the index of what left for it, -1 for nothing."""
+        left = -1
+        if self._own_past and self._steps >= self._copies * self._own_past.every_steps:
+            left = self._first_past + self._copies % self._held
+            self._all[left] = self._present()
+            self._copies += 1
+            self.policy = self._make_policy()
+        self._steps += self._worlds
+        return left
+
+    def get_extra_state(self) -> dict[str, Any]:
+        networks = {name: network.state_dict() for name, network in self.networks().items()}
+        counts = {"steps": self._steps, "copies": self._copies}
+        return {"rng": self.rng.state_dict(), **counts, "networks": networks}
+
+    def set_extra_state(self, state: Mapping[str, Any]) -> None:
+        self.rng.load_state_dict(state["rng"])
+        self._steps = state["steps"]
+        self._copies = state["copies"]
+        for name, network in self.networks().items():
+            network.load_state_dict(state["networks"][name])
+        self.policy = self._make_policy()
