@@ -29,11 +29,10 @@ from cprl.commands.recipe_command import exit_with_message
 from cprl.measuring.playing import evaluate, turns
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY
 from cprl.measuring.table import all_metrics, by_replica, complete, where
-from cprl.policies.actors import LaneActor, random_agents
+from cprl.policies.actors import random_agents
 from cprl.policies.decisions import stored_decisions
-from cprl.policies.governors import GovernorActor
 from cprl.policies.joint_policy import JointPolicy
-from cprl.policies.rng import Purpose, lane_seeds
+from cprl.policies.rng import Purpose
 from cprl.runs.episodes import read_rows, table_of, write_table
 from cprl.studies.trials import Trial
 from cprl.system.output import say
@@ -76,7 +75,7 @@ def play(run: LoadedRun, exploration: float) -> pa.Table:
         governor=run.governor(replicas),
     )
     env = make_worlds(experiment, experiment.replicas * worlds, fresh=True)
-    if all(ballot.period_episodes == 1 for ballot in run.game.ballots):  # else decisions stay in force
+    if all(ballot.period_episodes == 1 for ballot in run.game.in_force):  # else decisions stay in force
         next(turns(env, _random_policy(run)))
     return complete(table_of(evaluate(env, policy, explore=True), replicas))
 
@@ -97,24 +96,7 @@ def _random_policy(run: LoadedRun) -> JointPolicy:
         purpose=Purpose.RANDOM_PLAY,
     )
     actors = random_agents(run.spaces, everyone, replicas=count, seed=experiment.seed, worlds=worlds)
-    return JointPolicy(actors, decisions=decisions, governor=_random_governor(run))
-
-
-def _random_governor(run: LoadedRun) -> GovernorActor | None:
-    """Return a governor that decides at random; None for a run without one."""
-    experiment = run.experiment
-    if experiment.governor is None:
-        return None
-    governor = run.game.governor
-    seeds = lane_seeds(
-        experiment.seed,
-        replicas=range(experiment.replicas),
-        agents=[run.game.agents],
-        purpose=Purpose.RANDOM_PLAY,
-    )
-    worlds = experiment.evaluation_episodes
-    by = LaneActor(None, len(governor.options), seeds=seeds, agents=1, worlds=worlds)
-    return GovernorActor(governor, by)
+    return JointPolicy(actors, decisions=decisions)
 
 
 def rows_of(trial: Trial, table: pa.Table, exploration: float) -> pa.Table:
