@@ -54,9 +54,9 @@ _SHORT_NOTE: Final = (
 _NOTE: Final = (
     "Every value of the experiment below can be changed by its place. Agents that equal one before are not "
     "listed; they have the same arguments by their own number. What is not listed cannot be changed on the "
-    "command line, but in a copy of the recipe: the kind of an agent (Learning, Team, Scripted, Frozen, "
-    "Pool), of its algorithm (DQN, PPO and so on), of its network and of what it wants; transforms, "
-    "callbacks, drawn boards. A group of rules that is None is made by a flag of its fields, e.g. "
+    "command line, but in a copy of the recipe: the kind of an agent (Learning, Scripted and so on), of its "
+    "algorithm (DQN, PPO and so on), of its network and of what it wants; transforms, callbacks, drawn "
+    "boards. A group of rules that is None is made by a flag of its fields, e.g. "
     "--game.rules.random-end.prob 0.15."
 )
 _HELP: Final = {"-h", "--help", "--help-all", "--help_all"}
