@@ -200,7 +200,8 @@ LOSSES = {
     "a buffer that counts": own(CountingBuffer),
     "a running mean": own(RunningMean),
     "a running mean that is replaced": own(ReplacedMean),
-    "batch norm in the network": with_layer(lambda: nn.BatchNorm1d(12)),
+    # Right behind a linear layer it would cancel the layer's bias, whose steps were then of rounding alone.
+    "batch norm in the network": with_layer(lambda: nn.Sequential(nn.Tanh(), nn.BatchNorm1d(12))),
     "targets of its own": own(OwnTargets),
     "a number that counts": own(CountingNumber),
     "the first batch's mean": own(KeepsTheFirst),

@@ -10,10 +10,10 @@ all have one. Tenths in which a replica has less than fifty turns are left out.
 from pathlib import Path
 from typing import Final
 
+import governor
 import numpy as np
 import tyro
 from asking import trained
-from governor import STUDY
 
 from cprl import keys, load
 from cprl.measuring.playing import turns
@@ -29,7 +29,7 @@ FEWEST: Final = 50
 
 def courses(condition: str) -> tuple[Float64, Float64]:
     """Return the mean number in force by tenths of the stock and of the episode, [R, 10] each."""
-    run = load(trained(STUDY, condition)[0].run)
+    run = load(trained(governor.STUDY, condition)[0].run)
     by_stock, by_time = [], []
     for replica in run.replicas:
         env = run.env(WORLDS, seed=SEED, first_world=replica * WORLDS)
