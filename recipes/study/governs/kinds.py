@@ -66,7 +66,9 @@ def main(*, model: str = "", base_url: str = "http://127.0.0.1:11434/v1", every_
         spec = Language(
             model=model, base_url=base_url, every_steps=every_steps, fallback="random", max_tokens=60
         )
-        rows.append(played_row(f"{model}, a plan in {every_steps} steps", spec, Fresh(1, replicas=(0,))))
+        rows.append(
+            played_row(f"{model}, a plan in {every_steps} steps", spec, Fresh(episodes=1, replicas=(0,)))
+        )
     lines = [
         "# Kinds of agents on commons",
         "",
