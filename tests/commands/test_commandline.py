@@ -704,6 +704,7 @@ def help_at_80_columns(command, monkeypatch, capsys):
     return capsys.readouterr().out
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("command", ["", *(name for name in cli.COMMANDS if name not in ("sweep", "search"))])
 def test_help_fits_80_columns_and_shows_no_default_that_says_nothing(command, monkeypatch, capsys):
     said = help_at_80_columns(command, monkeypatch, capsys)

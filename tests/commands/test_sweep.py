@@ -260,6 +260,7 @@ def test_help_says_how_values_are_written_and_what_a_command_line_cannot_change(
         assert "the kind of an agent (Learning, Scripted and so on), of its algorithm" in said
 
 
+@pytest.mark.integration
 def test_stored_and_shipped_recipes_are_varied_too_and_a_study_is_not(tmp_path, capsys):
     run = start_run(tmp_path / "old.py", TINY.name, TINY.to_recipe)
     for source in (run, run / "recipe.json"):

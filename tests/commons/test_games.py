@@ -115,6 +115,7 @@ def games(draw):
     return replace(game, map=replace(board, spawns=spawns), rules=rules)
 
 
+@pytest.mark.integration
 @pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")
 @settings(max_examples=80, deadline=None)
 @given(games(), st.integers(0, 2**32))

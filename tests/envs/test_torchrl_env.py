@@ -252,6 +252,7 @@ def regrown_by_worker(vec_env, seed=None, **options):
         vec_env.close()
 
 
+@pytest.mark.integration
 @pytest.mark.filterwarnings("ignore:A lambda function was passed", "ignore:.*fork:DeprecationWarning")
 @VECTORS
 def test_workers_of_one_call_play_different_worlds(kind):

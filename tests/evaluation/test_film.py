@@ -258,6 +258,7 @@ def test_what_cannot_be_filmed_is_refused_before_anything_is_played(
     assert [path.name for path in tmp_path.iterdir()] == ["there.gif"]
 
 
+@pytest.mark.integration
 def test_the_command_says_what_it_wrote(runs, tmp_path, monkeypatch, capsys):
     filmed = partial(command, monkeypatch, capsys, "film", runs / "greedy", "--out")
     assert filmed(tmp_path / "own.gif", "--width", 240).splitlines()[:2] == [

@@ -89,6 +89,7 @@ def test_the_replica_is_the_one_whose_survival_is_nearest_to_the_median(run, tmp
     assert typical_replica(load(alike)) == 2, "of equal lives the harvest in the middle"
 
 
+@pytest.mark.integration
 def test_the_episode_is_the_one_of_five_whose_turns_and_apples_are_nearest_to_the_medians(run, tmp_path):
     reached = first_five(run, 0, tmp_path)
     medians = np.median(TURNS), np.median(APPLES)
@@ -150,6 +151,7 @@ def test_a_run_without_an_evaluation_of_learners_shows_its_first_episode(tmp_pat
     assert fresh_episode(run).description == "Replica 0, episode 0."
 
 
+@pytest.mark.integration
 def test_film_show_report_and_play_show_a_typical_one_and_say_so(run, tmp_path, monkeypatch, capsys):
     words = fresh_episode(run).description
     assert words in command(monkeypatch, capsys, "film", run, "--out", tmp_path / "a.gif", "--width", 240)
@@ -182,6 +184,7 @@ def test_the_worlds_of_a_training_are_refused_as_fresh_ones(run, tmp_path, how):
     assert not [*tmp_path.iterdir()]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("seed", [FILM_SEED, PLAY_SEED])
 def test_by_default_no_world_of_a_training_is_taken(tmp_path, seed):
     """Agents of a run that was trained with the default seed play the worlds of the next one."""

@@ -56,6 +56,7 @@ def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_fi
     assert (run / recording.name).stat().st_size > 10_000
 
 
+@pytest.mark.integration
 def test_what_a_callback_writes_into_learning_is_logged(tmp_path):
     log = Custom("torchrl.record.loggers:CSVLogger", arguments={"exp_name": "own", "log_dir": str(tmp_path)})
     cprl.run(replace(MEADOW, loggers=[log]), tmp_path / "run", watch="off")
@@ -136,6 +137,7 @@ FLAT = Custom(
 )
 
 
+@pytest.mark.integration
 def test_scripted_policies_that_read_a_window_are_refused_where_there_is_none():
     with pytest.raises(ValueError, match=r"Scripted\('greedy'\) reads the window of a"):
         cprl.run(replace(DILEMMA, agents=[Scripted("greedy"), Scripted()]), "never")

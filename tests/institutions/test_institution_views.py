@@ -201,6 +201,7 @@ def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
     assert sum(map(len, marks)) > 3
 
 
+@pytest.mark.integration
 def test_a_film_marks_who_broke_a_rule_since_its_last_picture(whole, tmp_path):
     cprl.trust(*ALLOW)
     path, (episode,) = film_video(whole, tmp_path / "film.gif", style=Style(width=400, every=1))

@@ -161,6 +161,7 @@ WITH_NETWORKS = [(kind, network) for kind in VMAPPED for network in (None, Conv(
 WITH_NETWORKS += [(kind, CELLS) for kind in KINDS if kind.can_be_recurrent]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("kind", "network"), WITH_NETWORKS, ids=str)
 def test_an_own_loss_of_an_algorithm_that_says_nothing_learns_the_same_and_is_no_list(kind, network):
     """Each lane learns what it would by the word that the algorithm says."""

@@ -210,6 +210,7 @@ def test_agents_that_play_for_themselves_end_with_the_same_weights_by_both_engin
     torch.testing.assert_close(weights(fast), weights(stock), rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", FIRST)
 def test_a_plain_training_is_that_of_the_training_loop(name):
     def stock_collector(env, policy):
@@ -357,6 +358,7 @@ def test_a_run_in_several_worlds_that_is_stopped_and_resumed_equals_a_whole_one(
     assert_same_training(parts, whole)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", [*FIRST, "SAC"])
 def test_nothing_draws_from_torchs_global_generator(name):
     learner, state = stock(ALGORITHMS[name]), torch.get_rng_state()

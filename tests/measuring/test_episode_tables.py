@@ -62,6 +62,7 @@ def test_a_metric_of_ones_own_is_called_like_no_column_of_an_evaluation(name):
         check_custom_metrics([Custom(f"mine:{name}")])
 
 
+@pytest.mark.integration
 def test_a_world_with_transforms_that_has_ended_is_traced_no_further():
     traces = []
     for wrapped in (lambda env: env, lambda env: TransformedEnv(env, StepCounter())):

@@ -298,6 +298,7 @@ def test_runs_play_with_each_other_as_they_decide(in_one_go, tmp_path):
         cprl.crossplay([other, cprl.run(taxed, tmp_path / "taxed", watch="off")])
 
 
+@pytest.mark.integration
 def test_films_and_people_who_play_have_decisions(in_one_go, tmp_path, monkeypatch):
     cprl.trust(*ALLOW)
     best = cprl.load(in_one_go).policy(0).decisions.best()[0]

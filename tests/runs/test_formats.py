@@ -124,6 +124,7 @@ READERS = [
 ]
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(("entries", "place"), ODD_RECIPES, ids=lambda value: str(value)[:30])
 @pytest.mark.parametrize("read", READERS, ids=["load", "table", "report", "extend"])
 def test_an_odd_recipe_is_refused_by_its_place(entries, place, read, changed):

@@ -100,6 +100,7 @@ class Signals:
             os.kill(os.getpid(), self.number)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("number", "kind"), [(signal.SIGINT, KeyboardInterrupt), (signal.SIGTERM, SystemExit)], ids=str
 )
@@ -114,6 +115,7 @@ def test_a_run_that_a_signal_stops_is_saved_and_raises_what_the_signal_means(
     assert_same(resumed(FIELD, tmp_path / "run"), whole)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_command_that_a_signal_stops_says_once_what_resumes_and_exits_as_shells_count(
     number, tmp_path, monkeypatch, capsys
@@ -211,6 +213,7 @@ def test_a_run_interrupted_in_any_stage_is_finished_by_resuming_it(stage, whole,
     assert (tmp_path / "run" / "report.json").exists()
 
 
+@pytest.mark.integration
 def test_a_finished_run_that_is_resumed_says_so_and_stays_as_it_is(whole, tmp_path, capsys):
     before = contents(whole)
     resumed(FIELD, whole)
@@ -364,6 +367,7 @@ def test_what_cannot_be_extended_bit_for_bit_is_refused_before_anything_is_writt
         resumed(replace(FIELD, episodes=6), damaged)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -416,6 +420,7 @@ def test_a_run_that_is_written_is_not_resumed_and_a_lock_of_another_host_is_take
     assert_same(stopped, whole)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("again", [False, True], ids=["deleted", "made again"])
 def test_a_deleted_run_ends_within_a_checkpoint_and_nothing_is_recreated(again, tmp_path, monkeypatch):
     monkeypatch.setattr(running, "Checkpointer", _often)
@@ -498,6 +503,7 @@ def test_files_are_written_as_the_umask_says(tmp_path):
     assert modes == dict.fromkeys(modes, 0o640)
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", ["checkpoints/final.pt", "evaluation/trained.parquet"])
 def test_a_run_that_lost_a_file_of_its_manifest_is_refused_by_that_file(name, whole, tmp_path):
     lost = shutil.copytree(whole, tmp_path / "run")
@@ -528,6 +534,7 @@ def test_an_ended_run_without_its_weights_is_never_played_from_an_older_checkpoi
 LINKS = ("run.lock", "episodes.arrows", "report.json", "recipe.json", "run.rrd", "checkpoints/final.pt")
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("name", [*LINKS, "checkpoints", "evaluation", "figures", "logs"])
 def test_a_run_with_a_link_out_of_it_is_refused_by_the_link_and_what_it_leads_to_stays(name, whole, tmp_path):
     begun, outside = copied(whole, tmp_path / "run"), tmp_path / "outside"

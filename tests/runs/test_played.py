@@ -85,6 +85,7 @@ def test_episodes_that_the_recipe_does_not_announce_are_refused(tmp_path):
     assert not list(run.glob("*.parquet"))
 
 
+@pytest.mark.integration
 def test_people_are_trained_by_no_run_and_no_study_and_nothing_is_written(tmp_path):
     experiment = an_experiment("classroom", MEADOW, (Person(), Scripted("greedy")))
     with pytest.raises(ValueError, match=r"agents\[0\] is a Person.*cprl host"):
@@ -94,6 +95,7 @@ def test_people_are_trained_by_no_run_and_no_study_and_nothing_is_written(tmp_pa
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.integration
 def test_an_agent_of_another_run_cannot_be_a_person(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     hosted(tmp_path / "classroom", MEADOW)

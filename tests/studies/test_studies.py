@@ -531,6 +531,7 @@ def shipped(monkeypatch):
         sys.modules.pop(name, None)
 
 
+@pytest.mark.integration
 def test_a_shipped_study_asks_a_question_and_says_what_is_expected(shipped):
     assert {"combat", "dip", "exploration", "no_beam"} <= {*SHIPPED}
     for name in SHIPPED:

@@ -395,6 +395,7 @@ def test_conditions_are_compared_by_the_last_episodes_and_pairs_of_replicas(pair
             condition_means(table, **options)
 
 
+@pytest.mark.integration
 def test_a_table_that_was_compared_is_freed_with_its_last_name(tmp_path):
     table = table_of(tmp_path, {TIME_OUT: [5, 25]})
     assert condition_means(table, ["equality"])

@@ -302,6 +302,7 @@ def write_module(tmp_path, monkeypatch):
     return write
 
 
+@pytest.mark.integration
 def test_a_study_runs_anew_what_was_made_with_other_code_and_keeps_what_was_there(
     tmp_path, write_module, capsys
 ):

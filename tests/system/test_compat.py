@@ -438,6 +438,7 @@ def summed_column(columns):
     return so_far
 
 
+@pytest.mark.integration
 def test_numba_gives_the_machine_code_of_a_function_unless_it_is_told_not_to_compile(tmp_path, monkeypatch):
     monkeypatch.setenv("CPRL_CACHE", str(tmp_path))
     monkeypatch.setenv(compiled.RULES_VARIABLE, compiled.COMPILED_RULES)
@@ -493,6 +494,7 @@ def grown_meadow(meadow, again):
 rained.__module__ = grow.__module__ = "cprl.tests"  # whose functions are rules
 
 
+@pytest.mark.integration
 @pytest.mark.parametrize("rains", [pytest.param(False, marks=pytest.mark.integration), True])
 def test_numba_takes_records_by_reference_and_rules_as_parts_of_one_piece(rains, tmp_path, monkeypatch):
     def meadow():

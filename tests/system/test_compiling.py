@@ -83,6 +83,7 @@ def compiles_as(monkeypatch):
     return lambda function: monkeypatch.setattr(compiling.torch, "compile", lambda *_, **__: function)
 
 
+@pytest.mark.integration
 def test_a_compiled_function_that_gives_other_numbers_is_found_out(compiles_as):
     values = [torch.ones(3), torch.ones(2)]
     step = Compiled(scaled_both, what="steps run", changes=(1,))

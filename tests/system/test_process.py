@@ -115,6 +115,7 @@ class Learner:
         self.own = self
 
 
+@pytest.mark.integration
 def test_what_a_training_leaves_in_cycles_is_freed_at_its_end():
     gc.disable()
     try:

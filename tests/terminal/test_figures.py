@@ -194,6 +194,7 @@ def test_a_figure_is_as_wide_as_a_page_or_a_column_and_a_long_title_wraps(width,
         assert captions["a.caption.txt"].endswith("\n\nMade up, here and now.\n")
 
 
+@pytest.mark.integration
 def test_the_suffix_says_what_is_written_the_same_each_time(tmp_path):
     for suffix, head in ((".png", b"\x89PNG"), (".pdf", b"%PDF"), (".svg", b"<?xml")):
         contents = []

@@ -49,6 +49,7 @@ def test_a_changed_prompt_is_refused_by_the_name_of_its_call(finished, tmp_path)
         run_language(changed, tmp_path / "changed")
 
 
+@pytest.mark.integration
 def test_a_run_that_is_stopped_resumes_and_asks_nothing_twice(finished, tmp_path):
     run, _ = finished
     calls = len(read_calls(run / CALLS))
@@ -98,6 +99,7 @@ def test_a_run_that_is_killed_resumes_and_asks_nothing_twice(finished, tmp_path)
     assert_same_training(run, tmp_path / "run")
 
 
+@pytest.mark.integration
 def test_progress_and_summary_count_calls_and_tokens_and_show_no_prompt_key_or_answer(
     tmp_path, capsys, monkeypatch
 ):

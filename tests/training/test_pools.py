@@ -90,6 +90,7 @@ def test_each_world_draws_for_itself_and_keeps_its_opponent_for_the_episode():
     assert len(sequences) > 3, "worlds draw apart"
 
 
+@pytest.mark.integration
 def test_all_opponents_are_equally_likely():
     pools = population([Pool(runs=(earlier(0),) * 3), Pool(runs=(earlier(0),) * 3), *[Scripted()] * 2]).others
     windows = CommonsEnv(GAME, 2, seed=1).reset()["agents", "observation"][:, :1]

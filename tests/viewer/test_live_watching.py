@@ -156,6 +156,7 @@ def test_a_way_to_watch_that_is_none_is_refused_before_anything_begins(tmp_path)
         course(tmp_path, live="telepathy")
 
 
+@pytest.mark.integration
 def test_without_a_display_no_viewer_is_spawned_and_the_addresses_stay(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
@@ -373,6 +374,7 @@ def ports_of(process):
     return {tuple(each.laddr) for each in connections if each.status == psutil.CONN_LISTEN}
 
 
+@pytest.mark.integration
 def test_a_page_with_a_short_address_is_on_this_machine_alone_until_it_is_closed(monkeypatch):
     monkeypatch.setattr("urllib.request._opener", None)  # it knows the proxies of before
     monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
@@ -403,6 +405,7 @@ def asked(port, line, host):
         return connection.makefile("rb").readline().decode().strip()
 
 
+@pytest.mark.integration
 def test_a_page_answers_this_machine_alone_and_odd_requests_with_an_error(capfd):
     served = WebViewer("rerun+http://127.0.0.1:9/proxy")
     try:
@@ -482,6 +485,7 @@ def test_a_process_that_is_killed_leaves_no_page():
     wait(lambda: not listens(port))
 
 
+@pytest.mark.integration
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 @pytest.mark.parametrize("serve", [True, False])
 def test_without_a_display_or_on_request_a_run_is_served_until_it_is_interrupted(
@@ -525,6 +529,7 @@ def test_without_a_display_or_on_request_a_run_is_served_until_it_is_interrupted
     assert layouts[0] == layouts[1], "views have names of their own"
 
 
+@pytest.mark.integration
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 @pytest.mark.parametrize("beside", [True, False])
 def test_a_recording_that_is_cut_is_served_up_to_there(beside, tmp_path):

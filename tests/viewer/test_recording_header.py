@@ -188,6 +188,7 @@ def test_header_and_timelines_count_the_episodes_that_all_replicas_have_ended(tm
     assert max(ends) <= 2
 
 
+@pytest.mark.integration
 @pytest.mark.filterwarnings("ignore:RRD file has no footer")
 def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_get_all_of_it(tmp_path):
     """Running means, label and new bests go on from the episodes in the table, which are not logged again."""
@@ -369,6 +370,7 @@ def test_a_recording_of_a_matrix_game_has_the_sum_of_returns_and_shares_of_joint
     assert column(path, "random_play/income", "Scalars:scalars")[1] == [[-7]]
 
 
+@pytest.mark.integration
 def test_the_file_closes_while_the_live_view_goes_on(tmp_path):
     with RerunLogger("run", tmp_path, curves=SCENE, live="serve") as logger:
         logger.log_document("header", "# one")

@@ -212,6 +212,7 @@ def test_the_board_has_a_rim_of_wall_and_inner_walls():
     assert boards(scene, nobody).tolist() == [[[WALL] * 4, [WALL, GROUND, WALL, WALL], [WALL] * 4]]
 
 
+@pytest.mark.integration
 def test_the_live_recording_is_served_on_this_machine_and_rows_that_another_client_adds_stay_there(tmp_path):
     with RerunLogger("run", tmp_path, live="serve", recording_id="one") as logger:
         address = logger.addresses["native"].split()[-1]
@@ -240,6 +241,7 @@ class Broken:
         return fail
 
 
+@pytest.mark.integration
 def test_a_stream_that_fails_is_dropped_with_one_warning_and_the_other_goes_on(tmp_path):
     with RerunLogger("run", tmp_path, curves=SCENE, live="serve") as logger:
         live = next(stream for stream in logger._streams if stream.name == "live view")

@@ -169,6 +169,7 @@ async def half_a_request(port, text):
         writer.close()
 
 
+@pytest.mark.integration
 def test_half_requests_are_closed_and_whole_ones_are_not_kept_open(tmp_path, monkeypatch):
     monkeypatch.setattr(serving, "REQUEST_SECONDS", 0.2)
 
@@ -186,6 +187,7 @@ def test_half_requests_are_closed_and_whole_ones_are_not_kept_open(tmp_path, mon
     ask(tmp_path, monkeypatch, question)
 
 
+@pytest.mark.integration
 def test_an_answer_that_takes_too_long_is_closed_and_a_socket_is_not(monkeypatch):
     monkeypatch.setattr(serving, "ANSWER_SECONDS", 0.2)
 

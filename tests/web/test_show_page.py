@@ -51,6 +51,7 @@ def told(path):
     return data
 
 
+@pytest.mark.integration
 def test_a_page_holds_the_episode_that_a_film_shows(runs, tmp_path):
     path, (first, second) = show(
         runs / "greedy", tmp_path / "own.html", beside=[runs / "governed"], episode=1
@@ -90,6 +91,7 @@ def test_a_page_holds_the_episode_that_a_film_shows(runs, tmp_path):
     assert data["most"] == max(*first.harvest, *second.harvest)
 
 
+@pytest.mark.integration
 def test_a_page_opens_without_a_network_and_is_small(runs, tmp_path):
     path, _ = show(runs / "governed", tmp_path / "own.html", beside=[runs / "governed"], titles=["a", "b"])
     text = path.read_text(encoding="utf-8")
