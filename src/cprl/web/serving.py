@@ -17,7 +17,7 @@ from contextlib import asynccontextmanager, closing
 from typing import Final
 
 try:
-    from aiohttp import HttpVersion10, HttpVersion11, web as web
+    from aiohttp import web as web
 except ModuleNotFoundError as error:
     raise ModuleNotFoundError(
         'pages are served by aiohttp, which is not installed; run pip install "cprl[web]"', name="aiohttp"
@@ -68,9 +68,8 @@ def _guarded(routes: Sequence[web.RouteDef], hosts: set[str]) -> web.Application
         host = request.headers.getall("Host", [])
         origin = request.headers.getall("Origin", [])
         is_ours = len(host) == 1 and host[0].lower() in hosts and request.raw_path.startswith("/")
-        is_known = request.version in (HttpVersion10, HttpVersion11)
         is_from_ours = not origin or origin[0].lower() in {f"http://{name}" for name in hosts}
-        if not is_known:
+        if request.version.major != 1:
             response: web.StreamResponse = web.Response(status=505)
         elif not is_ours or not is_from_ours or len(origin) > 1:
             response = web.Response(status=403, text="not here")
