@@ -15,15 +15,14 @@ family of all 4, by Holm's method.
 from dataclasses import replace
 from typing import Any, Final
 
-import numpy as np
-from asking import EXPERIMENT, GAME, Expectation, expected_text, game_with, trained
+from asking import EXPERIMENT, GAME, Expectation, expected_text, trained
+from changes import regrown
 from governor import QUOTA, STUDY as GOVERNOR, TAX
 
 import cprl
 from cprl.institutions import Institution
 from cprl.population import Frozen
 
-PROBS: Final = tuple((np.array(GAME.rules.regrow_prob) / 2).tolist())
 LEARNED: Final[dict[str, tuple[Institution, ...]]] = {"tax": TAX, "quota": QUOTA}
 HALVED: Final = "changes/regrowth x 0.5"
 """The same board without a rule."""
@@ -42,7 +41,7 @@ def conditions() -> dict[str, dict[str, Any]]:
     for rule, institutions in LEARNED.items():
         governor = frozen(rule)
         game = replace(GAME, institutions=institutions)
-        halved = replace(game_with(regrow_prob=PROBS), institutions=institutions)
+        halved = replace(regrown(0.5)["game"], institutions=institutions)
         table[f"{rule} kept"] = {"game": game, "governor": governor}
         table[f"{rule} kept, regrowth halved"] = {"game": halved, "governor": governor}
     return table

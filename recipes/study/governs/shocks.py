@@ -18,17 +18,15 @@ fast incomes are back is in courses.parquet.
 from dataclasses import replace
 from typing import Any, Final
 
-import numpy as np
-from asking import AGENT, EXPERIMENT, GAME, STEPS, Expectation, expected_text, trained
+from asking import AGENT, EXPERIMENT, STEPS, Expectation, expected_text, trained
 from best_response import COPY as VETERAN, RULES as TRAINED
-from changes import QUOTA, STUDY as CHANGES
+from changes import QUOTA, STUDY as CHANGES, regrown
 from order import HELD, RULES as INSTITUTIONS, under
 
 import cprl
 from cprl import EarlierGame
 from cprl.institutions import Institution
 
-PROBS: Final = tuple((np.array(GAME.rules.regrow_prob) / 2).tolist())
 BEFORE: Final[dict[str, tuple[Institution, ...]]] = {
     "no rule": (),
     "quota": INSTITUTIONS["quota 0.25"],
@@ -52,7 +50,7 @@ UNSHOCKED: Final = {
 def halved(rule: str) -> dict[str, Any]:
     """Return the condition in which regrowth is halved in the middle of a training under a rule."""
     after = under(AFTER[rule])
-    after = replace(after, rules=replace(after.rules, regrow_prob=PROBS))
+    after = replace(after, rules=replace(after.rules, regrow_prob=regrown(0.5)["game"].rules.regrow_prob))
     earlier = (EarlierGame(game=under(BEFORE[rule]), steps=STEPS),)
     return {"game": after, "earlier": earlier, "steps": 2 * STEPS}
 

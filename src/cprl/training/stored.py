@@ -125,13 +125,16 @@ class LoadedRun:
         return specs_by_agent(self.experiment.agents, self.game.agents)
 
     @property
-    def _governor(self) -> list[GovernorSpec]:
-        """Return the specification of the governor; [] without one."""
-        return [] if self.experiment.governor is None else [self.experiment.governor]
+    def all_specs(self) -> Sequence[AgentSpec | GovernorSpec]:
+        """Return the specification of each agent, and last that of the governor, if it has one."""
+        governor = self.experiment.governor
+        return self.specs if governor is None else [*self.specs, governor]
 
     def governor(self, replicas: Sequence[int]) -> list[StoredAgent]:
         """Return the governor of each of some replicas; [] without one."""
-        return [self.agent(self.game.agents, replica=replica) for replica in replicas if self._governor]
+        if self.experiment.governor is None:
+            return []
+        return [self.agent(self.game.agents, replica=replica) for replica in replicas]
 
     @cached_property
     def spaces(self) -> Spaces:
@@ -170,7 +173,7 @@ class LoadedRun:
 
     def agent(self, agent: int, *, replica: int = 0) -> StoredAgent:
         """Return an agent of a replica; its governor counts as the agent after the last one."""
-        specs = [*self.specs, *self._governor]
+        specs = self.all_specs
         if not 0 <= agent < len(specs):
             raise ValueError(f"agent is {agent}; {self.path} has the agents 0 to {len(specs) - 1}")
         spec = specs[agent]
@@ -340,7 +343,7 @@ def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module
         for name, state in weights.items():
             lane = name if "/" in name else f"replica_0/{name}"
             agent = int(lane.split("/")[1].removeprefix("agent_"))
-            spec = [*run.specs, *run._governor][agent]
+            spec = run.all_specs[agent]
             if isinstance(spec, Pool) and spec.own_past is not None:
                 spec = run.specs[spec.own_past.agent]
             if not isinstance(spec, Learning | Team):
