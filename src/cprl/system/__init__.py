@@ -9,7 +9,7 @@ Modules:
     process        settings of the process that trains, and where compiled code is kept
     shipped        the recipes that come with cprl, and how a command is typed again
     defaults       defaults that functions share with the command line
-    waiting_room   the places of what cprl.experimental offers, for those who ask by name
+    waiting_room   what cprl.experimental offers, for those who ask by its place
     working        says what the process does where it takes more than a second
     times          where the time of a training goes; whether code is being compiled
 """
