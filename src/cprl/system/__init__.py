@@ -3,6 +3,7 @@
 Modules:
     libraries      what an upgrade of a library has taken away, said by name
     compat         what relies on private parts of libraries, a module a library
+    jit            functions compiled by Numba: the rules of the game
     compiling      functions compiled by torch, and what that leaves in memory
     memory         devices, and what would not fit into their memory
     output         text for the terminal
