@@ -172,7 +172,7 @@ def test_a_plan_says_where_an_agent_harvests_and_whom_it_tags():
     assert not torch.equal(planned, played(board, ScriptedActor("aggressive", board, seeds=seeds, agents=4)))
     for region, tag in (([5, 0], [1]), ([0, 3], [1]), ([0, 0], [4])):
         with pytest.raises(ValueError, match="allowed"):
-            actor._answers.read({**plan, "region": region, "tag": tag})
+            actor._answers.read({"policy": "greedy", "region": region, "tag": tag})
 
 
 def test_a_message_is_read_by_all_other_agents_of_the_world_from_the_next_turn_on_and_in_its_episode_alone():

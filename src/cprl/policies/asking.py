@@ -69,7 +69,7 @@ class Model(Value, stored=False):
     timeout_s: Annotated[float, Range(0.01, 3600)] = 60.0
     """The most seconds that a try takes."""
     prices: tuple[Price, Price] | None = None
-    """What a million tokens of prompts, and of answers, cost, in US dollars; None if costs are not counted."""
+    """What a million tokens of prompts, and of answers, cost, in US dollars; None if they are not counted."""
     retries: Annotated[int, Range(0, 20)] = 2
     """How often a call is tried again, after silence or where the server is busy or fails."""
     backoff_s: Annotated[float, Range(0, 600)] = 1.0
@@ -138,7 +138,7 @@ class Calls:
         """
         hashes = [_hash(question.request(model)) for question in questions]
         by_hash = dict(zip(hashes, questions, strict=True))
-        new = [question for name, question in by_hash.items() if name not in self.kept]
+        new = [by_hash[name] for name in by_hash if name not in self.kept]
         self._most = model.max_calls
         if new and model.stored is not None:
             self._take(model, new)
@@ -294,8 +294,6 @@ def _body(message: Request, timeout_s: float) -> bytes:
                 raise TimeoutError
             if len(body) > _MOST_BYTES:
                 raise ValueError("too long")
-        if response.length:
-            raise ValueError("half an answer")
     return body
 
 

@@ -10,7 +10,7 @@ of the other agents of the world read in later turns.
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, TypeAlias
+from typing import Annotated, Any, Final, Literal, TypeAlias
 
 import numpy as np
 import torch
@@ -60,14 +60,7 @@ class Language(Model):
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Answer(Value, stored=False):
-    why: str = ""
-    message: Text = ""
-    """What the models of the other agents read, in games with talk."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class Plan(_Answer, stored=False, called="plan"):
+class Plan(Value, stored=False, called="answer"):
     """What an agent does until the next plan."""
 
     policy: ScriptedPolicy
@@ -188,12 +181,11 @@ class _BoardPlans:
         """Return the numbers that the channels of a name show."""
         return observation[np.array(self.game.channels) == channel].reshape(-1)
 
-    def read(self, table: Any) -> tuple[tuple[int, ...], str]:
-        """Return the numbers of a plan and its message; raise a ValueError if it is not allowed."""
-        plan = build(Plan, table, "plan")
-        checked("plan.signal", plan.signal, Annotated[int, Range(0, self.game.rules.signals)])
-        numbers = plan_numbers(self.game, plan.policy, plan.spare, plan.region, plan.tag)
-        return (*numbers, plan.signal), plan.message
+    def read(self, table: Any) -> tuple[int, ...]:
+        """Return the numbers of a plan; raise a ValueError if it is not allowed."""
+        plan = build(Plan, table, "answer")
+        checked("answer.signal", plan.signal, Annotated[int, Range(0, self.game.rules.signals)])
+        return *plan_numbers(self.game, plan.policy, plan.spare, plan.region, plan.tag), plan.signal
 
     def act(self, plans: Int64, tensordict: TensorDictBase) -> Int64:
         """Return actions, int64 [B, S], by plans, [B, S, 5 + N]."""
@@ -203,7 +195,7 @@ class _BoardPlans:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Action(_Answer, stored=False, called="answer"):
+class _Action(Value, stored=False, called="answer"):
     action: Natural
 
 
@@ -229,10 +221,9 @@ class _PlainActions:
         numbers = " ".join(f"{number:g}" for number in observation.reshape(-1).tolist())
         return f"Turn {turn + 1}.{last} You observe: {numbers}"
 
-    def read(self, table: Any) -> tuple[tuple[int, ...], str]:
-        answer = build(_Action, table, "answer")
-        checked("answer.action", answer.action, Annotated[int, Range(0, self._actions - 1)])
-        return (answer.action,), answer.message
+    def read(self, table: Any) -> tuple[int, ...]:
+        action = build(_Action, table, "answer").action
+        return (checked("answer.action", action, Annotated[int, Range(0, self._actions - 1)]),)
 
     def act(self, plans: Int64, tensordict: TensorDictBase) -> Int64:
         at_random = self._script.choose(tensordict.get("observation")).numpy(force=True)
@@ -270,15 +261,13 @@ class LanguageActor(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.spec = spec
-        self.playing = playing
         self.agents = agents
         self.worlds = worlds
         self.replicas = len(seeds) // agents
         size: dict[str, Any] = {"seeds": seeds, "agents": agents, "worlds": worlds}
-        self._answers: _BoardPlans | _PlainActions
         if isinstance(playing, Game):
             self.script: Any = ScriptedActor(spec.fallback, playing, **size)
-            self._answers = _BoardPlans(playing, self.script)
+            self._answers: Any = _BoardPlans(playing, self.script)
         else:
             self.script = scripted_lanes(spec.fallback, playing, **size)
             self._answers = _PlainActions(playing, self.script)
@@ -296,14 +285,12 @@ class LanguageActor(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation = tensordict.get("observation")
         memory = tensordict.get(recurrent_state.AFTER).numpy(force=True).copy()
-        begins = memory[..., _TURN] == 0
-        memory[begins, _PLAN:] = self._answers.fallback
-        for world, index in np.argwhere(begins).tolist():
+        for world, index in np.argwhere(memory[..., _TURN] == 0).tolist():
             self._said[world, self._numbers[index]] = []
         due = (memory[..., _NEXT] <= memory[..., _TURN]) & ~tensordict.get(keys.DONE).numpy(force=True)
         if keys.HARVEST[1] in self.in_keys:
             harvest = tensordict.get(keys.HARVEST[1]).numpy(force=True)
-            memory[..., _HARVEST] += np.where(begins, 0, harvest)
+            memory[..., _HARVEST] += harvest
             due &= tensordict.get(keys.IN_PLAY[1]).numpy(force=True)
         if due.any():
             self._ask(observation.numpy(force=True), memory, np.argwhere(due))
@@ -317,8 +304,9 @@ class LanguageActor(TensorDictModuleBase):
         """Ask for the plans of some agents, [n, 2] by world and agent, and write them into the memory."""
         questions = []
         for world, index in due.tolist():
-            seen = self._answers.seen(observation[world, index], memory[world, index])
-            heard = self._heard(world, self._numbers[index], memory[world, index, _TURN])
+            remembered = memory[world, index]
+            heard = self._heard(world, self._numbers[index], remembered[_TURN])
+            seen = self._answers.seen(observation[world, index], remembered)
             questions.append(self._question(world, index, "\n".join([*heard, seen])))
         answers = self._calls.ask(self.spec, questions, self._read)
         for (world, index), answer in zip(due.tolist(), answers, strict=True):
@@ -327,11 +315,12 @@ class LanguageActor(TensorDictModuleBase):
             if message:
                 self._said[world, self._numbers[index]].append((int(memory[world, index, _TURN]), message))
 
-    def _read(self, table: Any) -> tuple[tuple[int, ...], str]:
-        plan, message = self._answers.read(table)
-        if message and not self._answers.talks:
-            raise ValueError("there is a message; allowed in a game without talk: none")
-        return plan, message
+    def _read(self, table: dict[str, Any]) -> tuple[tuple[int, ...], str]:
+        """Return the numbers of a plan, and a message; raise a ValueError if they are not allowed."""
+        plan = dict(table)
+        checked("why", plan.pop("why", ""), str)
+        message = checked("message", plan.pop("message", ""), Text if self._answers.talks else Literal[""])
+        return self._answers.read(plan), message
 
     def _heard(self, world: int, listener: int, turn: float) -> list[str]:
         """Return the last message of each other agent before a turn, a line each; [] in a game without

@@ -197,7 +197,7 @@ class ScriptedActor(ActorOfLanes):
         return tensordict.set("action", self.choose(*map(tensordict.get, self.in_keys)))
 
     def choose(
-        self, observation: Tensor, apple_ahead: Tensor | None = None, plans: Int64 | None = None
+        self, observation: Tensor, apple_ahead: Tensor | None = None, *, plans: Int64 | None = None
     ) -> Tensor:
         """Choose actions, int64 [replicas x k, S].
 
