@@ -5,7 +5,7 @@
 Conditions of quota_size.py with ten times the steps: the schedule of asking.py is a tenth of the published
 one, whose exploration falls over 1,000,000 steps.
 
-4 conditions of 4,000,000 steps, 8 replicas: some 1.7 core hours. Contradicted by: agents who learn longer and
+4 conditions of 4,000,000 steps, 8 replicas: some 2 core hours. Contradicted by: agents who learn longer and
 do not spare a board without a rule, or get no more from a looser quota than from the tightest.
 """
 
