@@ -136,6 +136,11 @@ class Governing:
         loss = float(self._loss[replica]) if len(self._loss) else float("nan")
         return {"governor/loss": loss, "governor/epsilon": self.learner.actor.epsilon}
 
+    @property
+    def learners(self) -> dict[tuple[int, ...], Learner]:
+        """Return its learner by the agent after the last one; {} if it does not learn."""
+        return {} if self.learner is None else {self.learner.agents: self.learner}
+
     def networks(self) -> dict[str, nn.Module]:
         """Return copies of its networks, by "replica_0/agent_N" and so on; none if it does not learn."""
         return {} if self.learner is None else self.learner.networks()
