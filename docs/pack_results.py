@@ -4,12 +4,13 @@
 
 A table loses the metrics that `cprl.measuring.table.complete` computes from its totals, and the wanted return
 where agents want what they are paid; each other column is written in its smallest encoding. A file of
-weights is written with compression, which `torch.load` reads.
+weights is written with compression, which `torch.load` reads, and JSON without spaces.
 The manifest of a run is kept up to date.
 """
 
 import argparse
 import io
+import json
 import zipfile
 from collections.abc import Iterator
 from functools import partial
@@ -22,8 +23,9 @@ import pyarrow.parquet as pq
 
 from cprl.measuring.registry import METRICS, TOTALS
 from cprl.measuring.table import WINDOWS, complete
-from cprl.runs.files import write_listed
+from cprl.runs.files import MANIFEST_FILE, read_json, write_listed
 
+PACKED = ("*.parquet", "*.pt", "recipe.json", "study.json")
 WANTED = "wanted_return"
 _COMPRESSIONS = {"brotli": 11, "zstd": 22}
 _IN_ONE_PIECE = {
@@ -114,25 +116,26 @@ def compressed_weights(path: Path) -> bytes:
 
 
 def pack(path: Path) -> bytes:
-    """Return the packed content of a table of episodes or of a file of weights."""
+    """Return the packed content of a table, of a file of weights, or of one of JSON."""
     if path.suffix == ".pt":
         return compressed_weights(path)
+    if path.suffix == ".json":
+        return (json.dumps(read_json(path), separators=(",", ":")) + "\n").encode()
     return packed(without_derived(pq.read_table(path)))
 
 
 def main() -> None:
-    """Pack all tables of episodes and weights below the given folders, where that makes them smaller."""
+    """Pack tables, weights, recipes and studies below the given folders, where that makes them smaller."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("folders", type=Path, nargs="+")
     for folder in parser.parse_args().folders:
-        files = sorted([*folder.rglob("*.parquet"), *folder.rglob("*.pt")])
-        for path in (path for path in files if path.name != "table.parquet"):
+        for path in sorted(path for pattern in PACKED for path in folder.rglob(pattern)):
             before = path.stat().st_size
             content = pack(path)
             if len(content) >= before:
                 continue
-            run = path.parent if path.name == "episodes.parquet" else path.parents[1]
-            if (run / "manifest.json").exists():
+            run = path.parent if (path.parent / MANIFEST_FILE).exists() else path.parents[1]
+            if (run / MANIFEST_FILE).exists():
                 name = path.relative_to(run).as_posix()
                 write_listed(run, name, partial(copyfileobj, io.BytesIO(content)))
             else:

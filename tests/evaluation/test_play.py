@@ -229,3 +229,5 @@ def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch, capsys, words, 
 def test_agents_of_no_replica_are_refused(run):
     with pytest.raises(ValueError, match="replica is -1"):
         open_session(str(run), replica=-1)
+    with pytest.raises(ValueError, match=r"replica is 0.*allowed: with the agents of a run"):
+        open_session(str(run), others="greedy", replica=0)

@@ -291,9 +291,10 @@ def test_judged_expectations_are_those_of_the_committed_tables(study):
 
 
 @pytest.mark.integration
-def test_how_fast_incomes_are_back_is_that_of_the_committed_courses():
-    page = (RESULTS / "order" / "recovery.md").read_text(encoding="utf-8")
-    assert recovery_page(ROOT / "recipes" / "study" / "governs" / "order.py") == page
+@pytest.mark.parametrize("study", ["order", "shocks"])
+def test_how_fast_incomes_are_back_is_that_of_the_committed_courses(study):
+    page = (RESULTS / study / "recovery.md").read_text(encoding="utf-8")
+    assert recovery_page(ROOT / "recipes" / "study" / "governs" / f"{study}.py") == page
 
 
 @pytest.mark.integration

@@ -711,6 +711,9 @@ def test_the_results_of_a_study_are_a_table_a_summary_and_figures(grid_runs, tmp
     assert f"phases_{pair}.png" in [
         name for name, *_ in study_figures.figures_of(replace(table, endings=unlike))
     ]
+    unknown = {name: {} for name in table.endings}
+    figures = study_figures.figures_of(replace(table, endings=unknown))
+    assert not any(name.startswith("phases") for name, *_ in figures)
     assert StudyTable.read(tmp_path / "table.parquet").summary == table.summary
     text, (lacking,) = (tmp_path / "summary.md").read_text(), table.missing_runs
     for line in (

@@ -177,7 +177,7 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
     """
     gained = gains(table)
     returns = estimates(table, FOCAL_RETURN, PAIR).column(FOCAL_RETURN)
-    texts = {pair: f"{returns[pair].value:.3g}" for pair in returns if pair[0] == pair[1]}
+    self_play = {pair: f"{returns[pair].value:.3g}" for pair in returns if pair[0] == pair[1]}
     unit = f", {rewards_of(table)}".removesuffix(", ")
     diagonal = table_note(table, "diagonal").replace("_", "-")
     rows, columns = (dict(zip(labels, labels, strict=True)) for labels in matrix_labels(gained))
@@ -185,6 +185,7 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
         panels = sheet.panels(len(_GAINS), high=matrix_height(len(rows)))
         for axes, (metric, panel_title) in zip(panels, _GAINS.items(), strict=True):
             values = {}
+            texts = dict(self_play)
             for pair, estimate in gained.column(metric).items():
                 values[pair] = estimate.value
                 texts[pair] = f"{estimate.value:+.3g}" + " *" * estimate.differs

@@ -181,7 +181,7 @@ def open_session(
     agent = checked("agent", agent, Annotated[int, Range(0, game.agents - 1)])
     if others is None:
         others = "greedy" if run is None else board
-    if replica and others in SCRIPTED_POLICIES:
+    if replica is not None and others in SCRIPTED_POLICIES:
         raise ValueError(f'replica is {replica}, and others is "{others}"; allowed: with the agents of a run')
     others_run = _run_of(others, board, run)
     runs = [] if others_run is None else [others_run]

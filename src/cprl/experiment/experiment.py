@@ -284,18 +284,19 @@ def _check_numbers(experiment: Experiment) -> None:
 
 def _check_earlier(experiment: Experiment) -> None:
     worlds = experiment.worlds
-    most = (experiment.steps or 0) - worlds
+    steps_before = 0
     for index, part in enumerate(experiment.earlier):
         name = f"experiment.earlier[{index}].steps"
         if experiment.steps is None:
             raise ValueError(f"{name} is {part.steps}; allowed in a training of steps, not of episodes")
-        before = sum(other.steps for other in experiment.earlier[:index])
-        if not worlds <= part.steps <= most - before:
+        most = experiment.steps - steps_before - worlds
+        if not worlds <= part.steps <= most:
+            after = f", after {steps_before} steps" if steps_before else ""
             raise ValueError(
-                f"{name} is {part.steps}; allowed in {experiment.steps} steps of {worlds} worlds"
-                f"{f', after {before} steps' * (before > 0)}: {worlds} to {most - before}, so that each game "
-                "has a turn"
+                f"{name} is {part.steps}; allowed in {experiment.steps} steps of {worlds} worlds{after}: "
+                f"{worlds} to {most}, so that each game has a turn"
             )
+        steps_before += part.steps
 
 
 def _check_agents(experiment: Experiment, schedule: Schedule) -> None:

@@ -62,7 +62,7 @@ def map_figures(
             draw = partial(heat_map, table, pair, metric=metric)
             file_name = f"map_{name}_{file_name_of(metric)}{suffix}"
             yield StudyFigure(file_name, f"{title(metric)} by {what}", draw)
-        if len({next(iter(counts)) for counts in table.endings.values()}) > 1:
+        if len({next(iter(counts)) for counts in table.endings.values() if counts}) > 1:
             what = f"In which phase most replicas end, by {what}"
             draw = partial(phase_diagram, table, pair)
             yield StudyFigure(f"phases_{name}{suffix}", what, draw)
@@ -71,18 +71,18 @@ def map_figures(
 def grids(design: StudyDesign) -> dict[tuple[str, str], Grid]:
     """Return, for each pair of factors, the conditions that share the reference's levels of other factors.
 
-    None for random draws, and pairs of which a factor has a single level left.
+    There are none for random draws, and for pairs of which a factor has a single level left.
     """
     by_pair: dict[tuple[str, str], Grid] = {}
-    at = design.conditions[design.reference]
-    for one, other in combinations(design.factors, 2) if design.is_grid else ():
-        rest = [factor for factor in design.factors if factor not in (one, other)]
+    reference_levels = design.conditions[design.reference]
+    for first, second in combinations(design.factors, 2) if design.is_grid else ():
+        other_factors = [factor for factor in design.factors if factor not in (first, second)]
         grid = {}
         for name, levels in design.conditions.items():
-            if all(levels[factor] == at[factor] for factor in rest):
-                grid[levels[one], levels[other]] = name
+            if all(levels[factor] == reference_levels[factor] for factor in other_factors):
+                grid[levels[first], levels[second]] = name
         if all(len(set(levels)) > 1 for levels in zip(*grid, strict=True)):
-            by_pair[one, other] = grid
+            by_pair[first, second] = grid
     return by_pair
 
 
@@ -107,8 +107,8 @@ def heat_map(
     tested = tuple(dict.fromkeys([*compared_metrics(table), metric]))
     levels = condition_means(table, [metric])
     differences = condition_differences(table, tested)
-    maps = [_map_of_means(grid, _at(grid, metric, levels))]
-    changes = _at(grid, metric, differences)
+    maps = [_map_of_means(grid, _estimates_by_levels(grid, metric, levels))]
+    changes = _estimates_by_levels(grid, metric, differences)
     if changes:
         maps.append(_map_of_differences(grid, changes, table.design.reference))
     with drawing(path, width=width, colours=PNG_SHADES) as sheet:
@@ -120,7 +120,7 @@ def heat_map(
                 axes,
                 rows,
                 columns,
-                {pair: one.value for pair, one in content.estimates.items()},
+                {pair: estimate.value for pair, estimate in content.estimates.items()},
                 content.texts,
                 is_difference=content.is_difference,
                 share=1 / side_by_side,
@@ -178,10 +178,12 @@ def _difference_note(
     return f"{note}."
 
 
-def _at(grid: Grid, metric: str, family: Family) -> dict[Any, Estimate]:
+def _estimates_by_levels(grid: Grid, metric: str, family: Family) -> dict[Any, Estimate]:
     """Return the defined estimates of a metric, by the levels of two factors."""
     by_pair = {pair: family.get((name, metric)) for pair, name in grid.items()}
-    return {pair: one for pair, one in by_pair.items() if one is not None and one.replicas}
+    return {
+        pair: estimate for pair, estimate in by_pair.items() if estimate is not None and estimate.replicas
+    }
 
 
 def phase_diagram(
@@ -216,19 +218,24 @@ def _grid_of(table: StudyTable, factors: tuple[str, str]) -> tuple[Grid, str]:
     if tuple(factors) not in by_pair:
         pairs = "; ".join(map(" and ".join, by_pair))
         raise refusal("factors", factors, pairs or "none, as the conditions are no grid of two factors")
-    at = design.conditions[design.reference]
-    rest = [f"{factor_word(factor)} {at[factor]}" for factor in design.factors if factor not in factors]
+    reference_levels = design.conditions[design.reference]
+    held = [
+        f"{factor_word(factor)} {reference_levels[factor]}"
+        for factor in design.factors
+        if factor not in factors
+    ]
     grid = by_pair[factors[0], factors[1]]
     finished_only = {levels: name for levels, name in grid.items() if table.replicas[name]}
     rows, columns = _levels_of(finished_only or grid)
     grid = {pair: name for pair, name in grid.items() if pair[0] in rows and pair[1] in columns}
-    return grid, f" Elsewhere: {', '.join(rest)}." if rest else ""
+    return grid, f" Elsewhere: {', '.join(held)}." if held else ""
 
 
 def _levels_of(grid: Grid) -> tuple[dict[Any, str], dict[Any, str]]:
     """Return the levels of both factors, ordered, with their texts."""
-    rows, columns = zip(*grid, strict=True)
-    return {level: _word(level) for level in rows}, {level: _word(level) for level in columns}
+    rows = {row: _word(row) for row, _ in grid}
+    columns = {column: _word(column) for _, column in grid}
+    return rows, columns
 
 
 def _word(level: Any) -> str:
