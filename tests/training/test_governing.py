@@ -223,8 +223,8 @@ def test_a_replica_alone_is_the_same_as_beside_others():
     alone = training_of(replace(experiment, replicas=1))
     for training in (both, alone):
         training.run()
-    weights = both.governor.networks()["replica_0/agent_2"].state_dict()
-    for name, weight in alone.governor.networks()["replica_0/agent_2"].state_dict().items():
+    weights = both.governor.learner.networks()["replica_0/agent_2"].state_dict()
+    for name, weight in alone.governor.learner.networks()["replica_0/agent_2"].state_dict().items():
         assert torch.allclose(weight, weights[name], atol=1e-6), name
 
 
