@@ -174,15 +174,6 @@ def test_other_libraries_read_the_table_of_a_run_as_the_docs_say(library, tmp_pa
     assert "0.878" in capsys.readouterr().out, "the equality of replica 0"
 
 
-@pytest.mark.integration
-def test_the_collector_of_several_processes_runs_as_a_script(tmp_path):
-    (code,) = (code for code in codes(ROOT / "docs/studies.md") if '__name__ == "__main__"' in code)
-    (tmp_path / "collect.py").write_text(code)
-    done = subprocess.run([sys.executable, "collect.py"], cwd=tmp_path, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout
-
-
 OF_RECIPES = ("run", "sweep", "search", "--version")
 """Commands whose options a recipe adds."""
 

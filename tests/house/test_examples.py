@@ -3,6 +3,7 @@
 import importlib.util
 import re
 import runpy
+import subprocess
 import sys
 from collections import Counter
 from dataclasses import replace
@@ -28,6 +29,7 @@ PRINTS = {
     "own_network": "agent_0: ConvNetwork, [0-9,]+ weights\n.*agent_1: Tanh, [0-9,]+ weights",
     "own_loss": rf"__main__:huber: {NUMBER}, {NUMBER} apples\n__main__:Hysteretic: {NUMBER}, {NUMBER} apples",
     "own_institution": rf"fee 0.5: \d+ shots, which cost {NUMBER} apples",
+    "stop_bites": r"a reserve of 3: [23] to [23] apples are left",
     "own_game": rf"trained, agent_0/return: {INTERVAL}\nrandom, agent_0/return: {INTERVAL}",
     "evaluate": rf"collective_return, trained - random: {INTERVAL}\ntensor\(\[\[",
     "sweep": rf"collective_return, freeze_steps=25: {INTERVAL}\n.*/summary.md",
@@ -37,6 +39,8 @@ PRINTS = {
     "iql": r"agent_0: [01]\.\d\d\nreplica_0/agent_1: [01]\.\d\d",
 }
 """What each example prints at its end."""
+BY_THEMSELVES = ("remote_agent", "collect")
+"""Examples that no test runs in its process: tests/web serves the game of one, the other spawns processes."""
 EASY = Game(
     map=maps.parse(">.A.\n....\n.A.<"), rules=Rules(regrow_prob=(0.5,), may_fire=False, episode_steps=60)
 )
@@ -68,9 +72,17 @@ def test_an_example_is_short_says_what_it_shows_and_has_a_place_in_the_one_list(
 
 
 @pytest.mark.integration
+def test_the_collector_of_several_processes_runs_as_a_script(tmp_path):
+    command = [sys.executable, str(EXAMPLES / "collect.py")]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) == 10
+
+
+@pytest.mark.integration
 @pytest.mark.parametrize(
     "path",
-    [path for path in OF_CPRL if path.stem != "remote_agent"],  # tests/web serves the game that it needs
+    [path for path in OF_CPRL if path.stem not in BY_THEMSELVES],
     ids=lambda path: path.stem,
 )
 def test_an_example_prints_at_its_end_what_it_says(path, tmp_path, monkeypatch, capsys):

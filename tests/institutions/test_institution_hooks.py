@@ -8,11 +8,11 @@ import pytest
 from boards import Play
 
 from cprl.commons import apples, loops, threads, world
-from cprl.commons.compiled import PLAIN_RULES, RULES_VARIABLE
 from cprl.commons.rules import GROUPS
 from cprl.institutions import Tax, hooks, ledger
 from cprl.institutions.arrays import InState, filled
 from cprl.institutions.law import MODULES
+from cprl.system.jit.compiled import PLAIN_RULES, RULES_VARIABLE
 
 TOGETHER = (world, *GROUPS.values(), ledger, *MODULES.values(), permits)
 

@@ -1,4 +1,5 @@
-"""The institution of a user's own in docs/institutions.md: what it charges, and how it is resumed."""
+"""Institutions of a user's own, in docs/institutions.md and in examples: what they take, and how they are
+resumed."""
 
 import importlib
 import re
@@ -28,8 +29,11 @@ BOARD = maps.parse("A>..<.A\n.......\nA.....A")
 
 @pytest.fixture(params=["licence"])
 def licence(request, tmp_path, monkeypatch):
-    """A module of the page, where a user would have it."""
-    (code,) = re.findall(rf"```python\n(# {request.param}\.py\n.*?)```", PAGE.read_text(), re.DOTALL)
+    """A module of the page or an example, where a user would have it."""
+    if request.param == "licence":
+        (code,) = re.findall(r"```python\n(# licence\.py\n.*?)```", PAGE.read_text(), re.DOTALL)
+    else:
+        code = (ROOT / "examples" / f"{request.param}.py").read_text()
     (tmp_path / f"{request.param}.py").write_text(code)
     monkeypatch.syspath_prepend(tmp_path)
     importlib.invalidate_caches()
@@ -121,16 +125,16 @@ def test_what_an_own_rule_takes_is_measured_in_a_game_without_institutions(licen
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("licence", ["reserve"], indirect=True)
+@pytest.mark.parametrize("licence", ["stop_bites"], indirect=True)
 @pytest.mark.parametrize("engine", ["eager", "torchrl"])
 def test_a_transform_stops_bites_in_a_training_by_putting_apples_back(licence, engine, tmp_path):
     reserved = experiment(
         game=replace(game(regrow_prob=(0.0,), episode_steps=40, may_fire=False), institutions=()),
-        transforms=[Custom("reserve:Reserve", arguments={"least": 3})],
+        transforms=[Custom("stop_bites:Reserve", arguments={"least": 3})],
         callbacks=(),
         engine=engine,
     )
-    cprl.trust("reserve:Reserve")
+    cprl.trust("stop_bites:Reserve")
     run = cprl.run(reserved, tmp_path / "run", watch="off")
     table = read_episodes(run)
     assert table["return"].to_pylist() == table["harvest"].to_pylist()

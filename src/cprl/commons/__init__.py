@@ -36,13 +36,8 @@ The rules, each on one world, and the arrays that they work on:
     turn         the order of events in a turn and in an episode
     loops        the loops over worlds that a thread runs
 
-How the rules are compiled and run:
+How the rules are run, which `cprl.system.jit` compiles:
 
-    records      named tuples of arrays, passed by reference in compiled code
-    linking      joins all rules to one piece of machine code
-    code_key     a hash of all code that a function can reach
-    disk_cache   keeps compiled functions on disk, for all processes
-    compiled     compiles the rules, or runs them as plain Python
     threads      CpuThreads: runs the loops on CPU threads
     cuda         CudaThreads: runs the loops on a GPU
     state        checks a saved state before it is restored

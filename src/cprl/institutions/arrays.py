@@ -16,6 +16,7 @@ from typing import Annotated, Any, Final, NamedTuple, TypeVar, cast, get_args, g
 import numpy as np
 
 from cprl.values import MOST_INT32
+from cprl.values.array_types import is_record
 
 
 class InState(NamedTuple):
@@ -143,19 +144,12 @@ def state_arrays(arrays: Any, *, derived: bool = False) -> Iterator[tuple[str, A
             yield name, entry, field.role
 
 
-class Sliced(NamedTuple):
-    """A description of what the function made by `slicer` does, for the compiler of `records`."""
-
-    parts: tuple[Any, ...]
-    """For each entry of the tuple: True if world b is taken out of it, False if it stays as it is, and a
-    `Sliced` if it is a tuple itself."""
-
-
 def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
     """Make a function that takes world b out of a named tuple of arrays, and out of the tuples in it.
 
     The function is called as `one_law(arrays, b)`, and its result shares the memory of the arrays. Entries
-    without the axis of worlds stay as they are. For None it returns None.
+    without the axis of worlds stay as they are. For None it returns None. Its attribute `sliced` says what it
+    does with each entry, see `cprl.system.jit.records.by_reference`.
 
     Args:
         kind: the class of the named tuple.
@@ -188,13 +182,8 @@ def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
     )
     exec("\n    ".join(lines), names)
     function: Any = names[function_name]
-    function.sliced = Sliced(tuple(parts))
+    function.sliced = tuple(parts)
     return cast(Callable[[Any, int], Any], function)
-
-
-def is_record(kind: Any) -> bool:
-    """Return whether a value is a class of named tuples, e.g. `Worlds`."""
-    return isinstance(kind, type) and hasattr(kind, "_fields")
 
 
 def _tuple_in(field: Any) -> type[Any] | None:
