@@ -21,7 +21,7 @@ from cprl.evaluation.film import Style, film_video
 from cprl.policies.asking import CALLS, read_calls
 from cprl.population import Frozen, Learning, Scripted, learned
 from cprl.runs.export import export_results
-from cprl.studies.report import report
+from cprl.web.report import report
 from cprl.web.show import show
 
 

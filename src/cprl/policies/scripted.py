@@ -35,7 +35,6 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import keys
 from cprl.commons import cells
-from cprl.commons.compiled import compiled_for_cpu
 from cprl.commons.game import Game
 from cprl.commons.near import near_cells
 from cprl.commons.quirks import paints_over
@@ -55,6 +54,7 @@ from cprl.policies.scripted_rules import (
     SearchBuffers,
     Settings,
 )
+from cprl.system.jit.compiled import compiled_for_cpu
 from cprl.values import Range, checked
 from cprl.values.array_types import Int64, UInt8
 
