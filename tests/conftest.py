@@ -11,8 +11,8 @@ from places import TESTS
 import cprl
 from cprl import presets
 from cprl.algorithms import DQN
-from cprl.commons.compiled import PLAIN_RULES, RULES_VARIABLE
 from cprl.population import Learning, Scripted
+from cprl.system.jit.compiled import PLAIN_RULES, RULES_VARIABLE
 from cprl.values import METRIC_WORDS, trusting
 
 

@@ -33,7 +33,7 @@ REFERENCE: Final = {
     "viewer": "recordings for the Rerun viewer",
     "evaluation": "stored agents in fresh worlds and among each other",
     "studies": "one experiment under many conditions",
-    "web": "boards in a browser, and games that people play",
+    "web": "pages for a browser: episodes, reports, and games that people play",
     "experimental": "the waiting room: works, is tested, may change",
     "values": "frozen values, whose annotations say what a field allows, as tables; code of your own",
 }

@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 from random_play import harvests
 
-from cprl.commons.disk_cache import compile_with_disk_cache
 from cprl.commons.game import Game
 from cprl.commons.headings import COL_STEP, ROW_STEP
 from cprl.commons.moves import WALK_TURN
 from cprl.commons.near import neighbours
 from cprl.envs.commons_env import CommonsEnv
+from cprl.system.jit.disk_cache import compile_with_disk_cache
 from cprl.values import Range, Value
 from cprl.values.array_types import Bool, Float64
 

@@ -22,10 +22,10 @@ A package imports only from those above it:
     terminal     progress, summary, figures
     training     the loop: act, store, update, measure, record; run, load
     evaluation   stored agents in fresh worlds: alone, among each other and people
-    web          boards in a browser: episodes as a page, the explorable, games that people play
     studies      one experiment under many conditions: factors, trials, tables, figures
-    commands     the command line
+    web          pages for a browser: episodes, reports, the explorable, games that people play
     experimental  the waiting room, which may change and which no other package imports
+    commands     the command line
 """
 
 from importlib import import_module

@@ -17,6 +17,7 @@ from tiny_study import FREEZE, GAMMA, TINY
 
 from cprl import Study
 from cprl.commands import main as cli
+from cprl.commands.experimental_commands import search as search_words
 from cprl.commands.studies import (
     StudyOptions,
     carry_out,
@@ -25,7 +26,6 @@ from cprl.commands.studies import (
     study_main,
     sweep as sweep_words,
 )
-from cprl.experimental.commands import search as search_words
 from cprl.experimental.ray_executor import Ray
 from cprl.runs.files import RunLockedError
 from cprl.runs.recipe import start_run

@@ -15,12 +15,12 @@ from places import SUPPORT
 
 from cprl import CommonsEnv, keys, presets
 from cprl.algorithms import DQN
-from cprl.commons.compiled import PLAIN_RULES, RULES_VARIABLE
 from cprl.commons.literature import SOURCES
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.playing import evaluate
 from cprl.policies.actors import RandomActor
 from cprl.policies.joint_policy import JointPolicy
+from cprl.system.jit.compiled import PLAIN_RULES, RULES_VARIABLE
 from cprl.training import Schedule, train
 
 SCRIPT = SUPPORT / "cuda_in_simulator.py"

@@ -17,9 +17,10 @@ from random_games import (
 )
 
 from cprl import CommonsEnv, Game, Rules, maps, presets
-from cprl.commons import apples, beam, compiled, disk_cache, loops
+from cprl.commons import apples, beam, loops
 from cprl.commons.batch import Batch
 from cprl.institutions import sanctions
+from cprl.system.jit import compiled, disk_cache
 
 # Random walls and boundaries may part all agents from all apples.
 pytestmark = pytest.mark.filterwarnings("ignore:no agent can harvest:UserWarning")

@@ -16,11 +16,11 @@ from cprl.evaluation.fresh import averages_of, fresh_episodes, fresh_seed, typic
 from cprl.evaluation.play import open_session
 from cprl.runs.recipe import start_run
 from cprl.runs.weights import save_weights
-from cprl.studies.report import report
 from cprl.system.defaults import FILM_SEED, PLAY_SEED
 from cprl.training.evaluating import make_agents
 from cprl.training.stored import load
 from cprl.values import trust
+from cprl.web.report import report
 from cprl.web.show import show
 
 TURNS, APPLES = [9.0, 2.0, 4.0, 14.0], [20.0, 3.0, 11.0, 30.0]

@@ -28,10 +28,10 @@ from cprl.runs.files import (
 )
 from cprl.runs.recipe import read_recipe
 from cprl.studies import Study, read_study
-from cprl.studies.report import report
 from cprl.studies.tables.sources import circumstances_of
 from cprl.system.output import console, say
 from cprl.values import custom_targets
+from cprl.web.report import report
 
 STORED = DATA / "stored" / "run"
 """A run with a manifest: two episodes of `single_basic`, whose recipe has its command line."""

@@ -9,7 +9,6 @@ import pytest
 
 from cprl.experimental.factor_maps import heat_map
 from cprl.measuring.statistics import contrasts
-from cprl.studies.report import report
 from cprl.studies.results import write_summary
 from cprl.studies.study_figures import by_condition
 from cprl.studies.tables.comparing import compared_metrics, comparison_tables, condition_table
@@ -17,6 +16,7 @@ from cprl.studies.tables.effects import effect_tables, effect_weights, effects_o
 from cprl.studies.tables.tidy_table import StudyDesign, StudyTable
 from cprl.system.defaults import STUDY_TABLE
 from cprl.terminal.style import Sheet
+from cprl.web.report import report
 
 FINES, PROBS, REPLICAS = (0, 1, 4), (0.25, 1.0), 4
 NOISE = (-1.0, 0.0, 0.0, 1.0)

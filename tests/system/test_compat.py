@@ -30,15 +30,15 @@ from torchrl.objectives import DiscreteCQLLoss, DQNLoss, SoftUpdate, ValueEstima
 
 from cprl import CommonsEnv, Game, Rules, keys, maps
 from cprl.algorithms import PPO, RolloutSettings
-from cprl.commons import compiled, disk_cache
 from cprl.institutions.arrays import slicer
 from cprl.objectives.functional import FunctionalLoss, total, weights_of
 from cprl.system import compat
 from cprl.system.compat import recordings, tensordicts, torch_compile, torchrl
+from cprl.system.jit import compiled, disk_cache
 from cprl.system.libraries import fitting_versions, relying_on, require
 from cprl.values.array_types import Float64
 
-SOURCE = Path(compat.__file__).parents[1]
+SOURCE = Path(compat.__file__).parents[2]
 SHORT = Game(
     map=maps.parse(".A>.A\n.A.A.\n..<.A"), rules=Rules(window_rows=3, window_columns=5, episode_steps=9)
 )
@@ -46,7 +46,7 @@ SHORT = Game(
 
 def test_every_part_of_compat_has_a_test_that_names_it():
     shown = {name for name in vars(compat) if not name.startswith("_")}
-    modules = {path.stem for path in (SOURCE / "compat").glob("*.py")}
+    modules = {path.stem for path in (SOURCE / "system" / "compat").glob("*.py")}
     named = set(re.findall(r"compat\.(\w+)", Path(__file__).read_text()))
     assert shown - modules - named == set()
 
@@ -635,7 +635,7 @@ import sys, time
 from pathlib import Path
 from typing import Annotated, NamedTuple
 import numpy as np
-from cprl.commons import disk_cache
+from cprl.system.jit import disk_cache
 
 def doubled(values):
     return values * 2
@@ -676,11 +676,8 @@ LIBRARY_PARTS = (
 
 
 def test_private_parts_of_libraries_are_used_in_their_home_alone():
-    homes = {
-        *(SOURCE / "compat").glob("*.py"),
-        SOURCE / "commons" / "compiled.py",
-        SOURCE / "commons" / "disk_cache.py",
-    }
+    homes = {path for package in ("compat", "jit") for path in (SOURCE / "system" / package).glob("*.py")}
+    assert len(homes) > 8
     found = [
         f"{path.relative_to(SOURCE)}:{number}: {line.strip()}"
         for path in sorted(SOURCE.rglob("*.py"))

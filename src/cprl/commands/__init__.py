@@ -1,4 +1,4 @@
-"""The command line; with `cprl.experimental.commands` all that knows tyro.
+"""The command line; the only package that knows tyro.
 
 Modules, in the order in which one reads them:
     main            the command cprl: run, recipe, watch, export, and where the other commands are
@@ -10,4 +10,5 @@ Modules, in the order in which one reads them:
     table_command   cprl table
     host_command    cprl host
     sandbox_command  cprl sandbox
+    experimental_commands  cprl egta, exploit, schelling, search and visits, which may change
 """

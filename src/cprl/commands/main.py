@@ -30,7 +30,7 @@ from cprl.system.defaults import FILM_SEED
 from cprl.system.output import OUT, quote_command, say
 from cprl.system.process import obey_parent
 from cprl.system.shipped import PROGRAM, is_shipped, recipe_named, run_shipped, shipped_recipes
-from cprl.system.waiting_room import EXPERIMENTAL_COMMANDS as EXPERIMENTAL, experimental
+from cprl.system.waiting_room import experimental
 from cprl.system.working import working
 from cprl.values import did_you_mean
 
@@ -61,8 +61,14 @@ _GROUPS: Final[Mapping[str, Mapping[str, str]]] = {
 }
 """The commands in the order in which `cprl --help` lists them, each with the module of this package that has
 a function of that name."""
-_MODULES: Final = {name: module for group in _GROUPS.values() for name, module in group.items()}
-COMMANDS: Final = (*_MODULES, *EXPERIMENTAL)
+_EXPERIMENTAL: Final = dict.fromkeys(
+    ("egta", "exploit", "schelling", "search", "visits"), "experimental_commands"
+)
+"""The commands that may change, each with its module, too."""
+_MODULES: Final = {
+    name: module for group in (*_GROUPS.values(), _EXPERIMENTAL) for name, module in group.items()
+}
+COMMANDS: Final = tuple(_MODULES)
 """The names of all commands. A command imports torch, which takes seconds, after its words are checked."""
 
 _OPTIONS: Final = RunOptions()
@@ -119,10 +125,7 @@ def _call_with_flags(command: str, words: Sequence[str]) -> None:
 
 def _function(command: str) -> Callable[..., Any]:
     """Import and return the function of a command."""
-    if command in EXPERIMENTAL:
-        function: Callable[..., Any] = experimental(command)
-    else:
-        function = getattr(import_module(f"cprl.commands.{_MODULES[command]}"), command)
+    function: Callable[..., Any] = getattr(import_module(f"cprl.commands.{_MODULES[command]}"), command)
     return function
 
 
@@ -134,7 +137,7 @@ def _print_help() -> None:
         for name in names:
             about = (getdoc(_function(name)) or "").partition("\n\n")[0]
             lines.append(wrap_paragraphs(about, before=f"  {name:<10}  "))
-    others = f"Experimental, and may change: {', '.join(EXPERIMENTAL)}."
+    others = f"Experimental, and may change: {', '.join(_EXPERIMENTAL)}."
     say(
         "\n".join(
             [*lines, "", wrap_paragraphs(others), "", "cprl COMMAND --help lists the flags of a command."]
@@ -317,4 +320,5 @@ def export(
         return
     if not weights:
         raise ValueError(f"--no-weights is of results; allowed: without --format {format}")
-    experimental("export_turns")(run, out, format=format, episodes=episodes, replica=replica, seed=seed)
+    export_turns = experimental("export_turns.export_turns")
+    export_turns(run, out, format=format, episodes=episodes, replica=replica, seed=seed)

@@ -168,7 +168,7 @@ def report(run: Path, /, *, out: Path | None = None, episodes: int = 20, seed: i
     """
     begin_playing(seed, *([] if (run / STUDY_TABLE).is_file() else [run]))
 
-    from cprl.studies.report import report as report_on
+    from cprl.web.report import report as report_on
 
     path = report_on(run, out, episodes=episodes, seed=seed)
     say(f"{path}: {path.stat().st_size / 1000:.0f} kB; open it in a browser")

@@ -304,7 +304,7 @@ def executor_of(options: TrialOptions) -> "Executor":
     if on == "here" and jobs > 1:
         raise ValueError(f"--jobs is {jobs} with --on here; allowed: 1, or --on processes")
     if on == "ray":
-        ray: Executor = experimental("Ray")(options.address, jobs=options.jobs)
+        ray: Executor = experimental("ray_executor.Ray")(options.address, jobs=options.jobs)
         return ray
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return InProcess() if on == "here" else Processes(options.jobs or cores)

@@ -27,22 +27,18 @@ The rules, each on one world, and the arrays that they work on:
     chance       counter-based random numbers
     world        the arrays of B worlds: state, output of a step, working memory
     moves        walking, clashes, and the return of tagged agents
-    quirks       Quirks2019: rules in which the program of 2019 differs from its paper
     beam         beams, hits and tags
-    river        River: rules about waste in a river and its cleaning
     actions      an agent's action: walk, turn, fire, clean, signal
     apples       harvest and regrowth
     views        the picture of the board and the observations of agents
     turn         the order of events in a turn and in an episode
     loops        the loops over worlds that a thread runs
 
-How the rules are compiled and run:
+Groups of rules that are off by default have a module each, see `RuleGroups` in rules: `river`, about waste in
+a river and its cleaning, and `quirks`, in which the program of 2019 differs from its paper.
 
-    records      named tuples of arrays, passed by reference in compiled code
-    linking      joins all rules to one piece of machine code
-    code_key     a hash of all code that a function can reach
-    disk_cache   keeps compiled functions on disk, for all processes
-    compiled     compiles the rules, or runs them as plain Python
+How the rules are run, which `cprl.system.jit` compiles:
+
     threads      CpuThreads: runs the loops on CPU threads
     cuda         CudaThreads: runs the loops on a GPU
     state        checks a saved state before it is restored

@@ -11,13 +11,13 @@ import numba.cuda
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from cprl.commons.compiled import compiled
 from cprl.commons.game import Game
 from cprl.commons.loops import ENTRIES, Played, one_scratch
 from cprl.commons.rules import RuleGroups
 from cprl.commons.tables import Tables
 from cprl.commons.world import Scratch, Worlds, empty_scratch
 from cprl.institutions.arrays import map_arrays
+from cprl.system.jit.compiled import compiled
 from cprl.values.array_types import Int64
 
 cuda: Any = numba.cuda

@@ -10,7 +10,6 @@ from typing import Annotated, Any, Final
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from cprl.commons.compiled import compiled_for_cpu, machine_code, runs_plain
 from cprl.commons.game import Game, output_forms
 from cprl.commons.loops import Played, first_invalid, run_worlds, show_worlds
 from cprl.commons.rules import RuleGroups
@@ -18,6 +17,7 @@ from cprl.commons.tables import Tables
 from cprl.commons.world import empty_scratch, empty_worlds
 from cprl.institutions.arrays import state_arrays
 from cprl.institutions.law import new_law
+from cprl.system.jit.compiled import compiled_for_cpu, machine_code, runs_plain
 from cprl.system.memory import check_memory
 from cprl.values import Range, checked
 from cprl.values.array_types import Int64

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 
 from cprl.commons.batch import Driver
-from cprl.commons.compiled import PLAIN_RULES, RULES_VARIABLE, runs_plain
 from cprl.commons.game import Game
 from cprl.commons.threads import CpuThreads
+from cprl.system.jit.compiled import PLAIN_RULES, RULES_VARIABLE, runs_plain
 from cprl.values import refusal
 
 

@@ -1,7 +1,7 @@
 """The waiting room: what is here works and is tested, and may change from one version to the next.
 
 No other package imports it: the commands, the live view and studies ask `cprl.system.waiting_room` for a part
-by its name. What carries the library stands in the other packages. Names are imported from their modules.
+by its place. What carries the library stands in the other packages. Names are imported from their modules.
 
 Modules, in the order in which one reads them:
     schelling       what cooperators and defectors get, by how many of the others cooperate
@@ -20,5 +20,4 @@ Modules, in the order in which one reads them:
     exhibition      a world that the current policy plays, for viewers alone
     lawgiver        Lawgiver: a language model that gives institutions between episodes
     export_turns    fresh episodes for other programs, turn by turn: CSV, Minari
-    commands        cprl egta, exploit, schelling, search and visits
 """

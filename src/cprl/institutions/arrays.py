@@ -2,7 +2,7 @@
 
 The annotation of a field says the dtype, the axes and the role of its array. For example,
 `taken: Annotated[Int32, "B Q N", STEPS]` is an int32 array with three axes. An axis is a letter, whose length
-is given when the array is allocated, or a number, its length.
+is given when the array is allocated, a number, its length, or the name of a field `name: int` of the tuple.
 
 The axis B of worlds comes first; an array without it is a parameter of the game. The role is an `InState`,
 such as `IN_STATE` or `STEPS`, for an array that is part of a world's state, and `DERIVED` for an array that
@@ -16,6 +16,7 @@ from typing import Annotated, Any, Final, NamedTuple, TypeVar, cast, get_args, g
 import numpy as np
 
 from cprl.values import MOST_INT32
+from cprl.values.array_types import is_record
 
 
 class InState(NamedTuple):
@@ -46,7 +47,7 @@ class Field(NamedTuple):
     """The annotation of an array in a named tuple, taken apart."""
 
     axes: tuple[str, ...]
-    """The letter, or the length as text, of each axis."""
+    """The letter or name, or the length as text, of each axis."""
     dtype: type[np.generic]
     role: InState | str = ""
     """An `InState`, `DERIVED`, or "" without a role."""
@@ -98,6 +99,8 @@ def filled(kind: type[Tuple], values: Mapping[str, Any], **sizes: int) -> Tuple:
             entries[name] = values[name]
         elif not isinstance(field, Field):
             entries[name] = field(values[name])
+            if field is int:
+                sizes[name] = entries[name]
         elif name in values:
             entries[name] = np.ascontiguousarray(values[name], field.dtype)
             sizes |= dict(zip(field.axes, entries[name].shape, strict=True))
@@ -143,19 +146,12 @@ def state_arrays(arrays: Any, *, derived: bool = False) -> Iterator[tuple[str, A
             yield name, entry, field.role
 
 
-class Sliced(NamedTuple):
-    """A description of what the function made by `slicer` does, for the compiler of `records`."""
-
-    parts: tuple[Any, ...]
-    """For each entry of the tuple: True if world b is taken out of it, False if it stays as it is, and a
-    `Sliced` if it is a tuple itself."""
-
-
 def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
     """Make a function that takes world b out of a named tuple of arrays, and out of the tuples in it.
 
     The function is called as `one_law(arrays, b)`, and its result shares the memory of the arrays. Entries
-    without the axis of worlds stay as they are. For None it returns None.
+    without the axis of worlds stay as they are. For None it returns None. Its attribute `sliced` says what it
+    does with each entry, see `cprl.system.jit.records.by_reference`.
 
     Args:
         kind: the class of the named tuple.
@@ -188,13 +184,8 @@ def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
     )
     exec("\n    ".join(lines), names)
     function: Any = names[function_name]
-    function.sliced = Sliced(tuple(parts))
+    function.sliced = tuple(parts)
     return cast(Callable[[Any, int], Any], function)
-
-
-def is_record(kind: Any) -> bool:
-    """Return whether a value is a class of named tuples, e.g. `Worlds`."""
-    return isinstance(kind, type) and hasattr(kind, "_fields")
 
 
 def _tuple_in(field: Any) -> type[Any] | None:

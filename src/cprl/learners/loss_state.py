@@ -97,9 +97,10 @@ def _state_of(loss: LossModule) -> dict[str, _Entry]:
         if any(isinstance(modules[outer], TensorDictParams) for outer in _outer_paths(path)):
             continue  # weights
         attributes = {name: value for name, value in vars(module).items() if name not in _CHANGED_BY_TORCH}
-        for name, value in {**attributes, **module._buffers}.items():
+        buffers = dict(module.named_buffers(recurse=False, remove_duplicate=False))
+        for name, value in {**attributes, **buffers}.items():
             content = _content(value, weights, dict(met_modules))
-            state[f"{path}.{name}".removeprefix(".")] = _Entry(value, name in module._buffers, content)
+            state[f"{path}.{name}".removeprefix(".")] = _Entry(value, name in buffers, content)
     return state
 
 

@@ -34,7 +34,6 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import keys
 from cprl.commons import cells
-from cprl.commons.compiled import compiled_for_cpu
 from cprl.commons.game import Game
 from cprl.commons.near import near_cells
 from cprl.commons.quirks import paints_over
@@ -53,6 +52,7 @@ from cprl.policies.scripted_rules import (
     SearchBuffers,
     Settings,
 )
+from cprl.system.jit.compiled import compiled_for_cpu
 from cprl.values.array_types import Float64, Int64, UInt8
 
 ScriptedPolicy = Literal["random", "greedy", "sustainable", "territorial", "aggressive", "pacifist"]

@@ -11,7 +11,6 @@ Modules, in the order in which one reads them:
     tables          what came out, as one tidy table; means and differences
     study_figures   figures of a table
     results         write_results: table, summary and figures of a study
-    report          an HTML page about a run or a study
 """
 
 from cprl.studies.executors import InProcess, Processes

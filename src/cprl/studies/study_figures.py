@@ -99,7 +99,7 @@ def figures_of(
             differences = partial(by_condition, table, kind="differences", metrics=metrics)
             description = f"Differences from {design.reference}"
             yield StudyFigure(f"differences{suffix}", description, differences)
-    yield from experimental("map_figures")(table, suffix=suffix, metrics=metrics)
+    yield from experimental("factor_maps.map_figures")(table, suffix=suffix, metrics=metrics)
 
 
 DRAWN: Final = re.compile(r"(by_|map_|phases|levels|differences|courses).*\.(png|pdf|svg)")

@@ -496,7 +496,9 @@ def _make_viewer(watch: str, run: _OpenRun) -> "AbstractContextManager[ViewerCal
     from cprl.viewer.callback import ViewerCallback
 
     live = None if watch == "file" else watch
-    exhibit = None if live is None else partial(experimental("exhibition"), run.experiment, run.population)
+    exhibit = None
+    if live is not None:
+        exhibit = partial(experimental("exhibition.exhibition"), run.experiment, run.population)
     return ViewerCallback.of(run.experiment, run.directory, run.env, live=live, exhibit=exhibit)
 
 

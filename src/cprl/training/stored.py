@@ -434,7 +434,6 @@ def stored_governor(
         (by,) = stored_actors(
             {game.agents: stored},
             governor_spaces(game),
-            kinds={game.agents: stored[0].kind},
             seeds=lambda agents: seeds,
             worlds=worlds,
             stacks=True,

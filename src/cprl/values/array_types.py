@@ -1,4 +1,4 @@
-"""Types of numpy arrays, one for each dtype."""
+"""Types of numpy arrays, one for each dtype, and of named tuples of arrays."""
 
 from typing import Any, TypeAlias
 
@@ -15,3 +15,8 @@ Int32: TypeAlias = NDArray[np.int32]
 Int64: TypeAlias = NDArray[np.int64]
 Float32: TypeAlias = NDArray[np.float32]
 Float64: TypeAlias = NDArray[np.float64]
+
+
+def is_record(kind: Any) -> bool:
+    """Return whether a value is a class of named tuples, e.g. `cprl.commons.world.Worlds`."""
+    return isinstance(kind, type) and hasattr(kind, "_fields")

@@ -4,8 +4,7 @@ There is one function, class or constant for each, with a test in `tests/system/
 what an upgrade has broken. What is missing is an ImportError that names the part and the versions that fit
 (`cprl.system.libraries`). The rest of cprl uses public interfaces. Two exceptions are elsewhere:
 
-- code that relies on Numba is in `cprl.commons` (`compiled`, `disk_cache`, `records`, `linking`), because the
-  game works without torch;
+- code that relies on Numba is in `cprl.system.jit`;
 - methods with an underscore that a library expects its subclasses to define (`EnvBase._reset`, `_step` and
   `_set_seed`, `Storage._empty`, `Sampler._empty`, `Logger._create_experiment`) are its interface for that.
 

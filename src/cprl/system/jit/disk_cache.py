@@ -157,7 +157,7 @@ def _compile_in_child(in_child: Callable[[], Any], types: Any) -> None:
 
     If the child fails, nothing is stored. `in_child`: returns the function in the child process.
     """
-    start = "from cprl.commons.disk_cache import compile_for_parent; compile_for_parent()"
+    start = "from cprl.system.jit.disk_cache import compile_for_parent; compile_for_parent()"
     command = [sys.executable, "-c", f"import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); {start}"]
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     quiet = subprocess.DEVNULL

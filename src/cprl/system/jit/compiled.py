@@ -13,10 +13,10 @@ from typing import Any, Final
 
 import numba
 
-from cprl.commons.code_key import code_key, is_rule
-from cprl.commons.disk_cache import KEY_FILE, can_write, compile_with_disk_cache, numba_cache_in
-from cprl.commons.linking import AS_PART, AS_WHOLE
-from cprl.commons.records import VERSION, by_reference, type_of, with_local
+from cprl.system.jit.code_key import code_key, is_rule
+from cprl.system.jit.disk_cache import KEY_FILE, can_write, compile_with_disk_cache, numba_cache_in
+from cprl.system.jit.linking import AS_PART, AS_WHOLE
+from cprl.system.jit.records import VERSION, by_reference, type_of, with_local
 from cprl.system.libraries import relying_on
 from cprl.system.process import cache_folder
 from cprl.system.times import CLOCK

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 import tyro
 
@@ -34,9 +34,7 @@ from cprl.commands.studies import (
 from cprl.commons.published import check_board
 from cprl.system.defaults import EGTA_RESAMPLES, SEED, Fresh
 from cprl.system.output import say
-
-if TYPE_CHECKING:
-    from cprl.experimental.search import SearchResult
+from cprl.system.waiting_room import experimental
 
 _ABOUT_SEARCH: Final = "Search for good values of a recipe's experiment by Optuna, point by point."
 _BEST: Final = 10
@@ -77,8 +75,10 @@ def schelling(
     begin_playing(mixes.seed, files=files)
 
     from cprl.evaluation.play import board_named
-    from cprl.experimental.schelling import draw_schelling, schelling as play_all_mixes, schelling_tables
 
+    play_all_mixes = experimental("schelling.schelling")
+    schelling_tables = experimental("schelling.schelling_tables")
+    draw_schelling = experimental("schelling.draw_schelling")
     game, run = board_named(board, variant)
     fresh = Fresh(episodes=mixes.episodes, replicas=mixes.replicas, seed=mixes.seed)
     players = {"restrained": mixes.restrained, "greedy": mixes.greedy}
@@ -110,15 +110,13 @@ def egta(
     begin_playing(fresh.seed, *paths_of(runs_named), files=files)
 
     from cprl.evaluation.cross_play import crossplay
-    from cprl.experimental.empirical_game import (
-        analyse,
-        draw_egta,
-        egta_tables,
-        pairwise_game,
-        play_empirical_game,
-    )
-    from cprl.experimental.solutions import check_extras
 
+    pairwise_game = experimental("empirical_game.pairwise_game")
+    play_empirical_game = experimental("empirical_game.play_empirical_game")
+    analyse = experimental("empirical_game.analyse")
+    egta_tables = experimental("empirical_game.egta_tables")
+    draw_egta = experimental("empirical_game.draw_egta")
+    check_extras = experimental("solutions.check_extras")
     check_extras()
     game = pairwise_game(crossplay(runs_named, fresh)) if pairwise else play_empirical_game(runs_named, fresh)
     rows = tuple(path for path in files.out if path.suffix == ROWS)
@@ -176,10 +174,13 @@ def exploit(
         raise ValueError(f"--out names the directories {', '.join(map(str, folders))}; allowed: one")
     begin_playing(fresh.seed, run, files=files)
 
-    from cprl.experimental.exploit import TABLE, exploitability_tables, measure, plan_responses
     from cprl.studies.study import directory_of
     from cprl.terminal.text_tables import print_tables
 
+    plan_responses = experimental("exploit.plan_responses")
+    measure = experimental("exploit.measure")
+    exploitability_tables = experimental("exploit.exploitability_tables")
+    episodes_file = experimental("exploit.TABLE")
     plan = plan_responses(run, fresh, **vars(responses))
     folder = directory_of(plan.study, next(iter(folders), plan.out))
     options = StudyOptions(out=folder, jobs=jobs, dry_run=dry_run, figures=False)
@@ -192,7 +193,7 @@ def exploit(
     played = measure(plan, folder)
     tables = list(exploitability_tables(played))
     print_tables(tables)
-    say(f"Episodes: {folder / TABLE}")
+    say(f"Episodes: {folder / episodes_file}")
     files.write(played, tables)
 
 
@@ -224,11 +225,12 @@ def search(words: Sequence[str], /) -> None:
     """
     experiment, options = read_recipe_and_options(words, SearchOptions(), "cprl search", about=_ABOUT_SEARCH)
 
-    from cprl.experimental.search import Search, run_search
     from cprl.studies.factors import factors_of
     from cprl.studies.study import directory_of
 
-    plan = Search(experiment, factors_of(experiment, options.vary), **study_fields(options))
+    run_search = experimental("search.run_search")
+    new_search = experimental("search.Search")
+    plan = new_search(experiment, factors_of(experiment, options.vary), **study_fields(options))
     command = ["cprl", "search", *words]
     executor = executor_of(options)
     if options.dry_run:
@@ -241,8 +243,12 @@ def search(words: Sequence[str], /) -> None:
     say_result(result, command)
 
 
-def _say_best(result: "SearchResult") -> None:
-    """Print the best points of a search, and how many were refused."""
+def _say_best(result: Any) -> None:
+    """Print the best points of a search, and how many were refused.
+
+    Args:
+        result: a `cprl.experimental.search.SearchResult`.
+    """
     plan = result.search
     best = "highest" if plan.direction == "maximise" else "lowest"
     say(f"{plan.name}: {len(result.points)} points; the {best} {plan.metric}, means over replicas:")
@@ -272,9 +278,11 @@ def visits(
         raise ValueError("--random says who is drawn; allowed: with --figure FILE")
     begin_playing(fresh.seed, run, files=files)
 
-    from cprl.experimental.territory import draw_visits, territory_of, territory_table
     from cprl.training.stored import load
 
+    territory_of = experimental("territory.territory_of")
+    territory_table = experimental("territory.territory_table")
+    draw_visits = experimental("territory.draw_visits")
     loaded = load(run)
     table = territory_of(loaded, fresh)
     policy: Any = "random" if random else "trained"

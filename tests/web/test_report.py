@@ -15,10 +15,10 @@ from viewers import browser, wait_until
 from cprl import Custom, presets
 from cprl.evaluation import Fresh, evaluate_run
 from cprl.institutions import Quota
-from cprl.studies.report import report
 from cprl.terminal.summary import comparison_table
 from cprl.training.stored import load
 from cprl.values import trust
+from cprl.web.report import report
 from cprl.web.show import show
 
 STUDY = RESULTS / "studies" / "exploration"

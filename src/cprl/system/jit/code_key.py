@@ -8,7 +8,7 @@ from typing import Any, get_args, get_type_hints
 
 import numpy as np
 
-from cprl.institutions.arrays import is_record
+from cprl.values.array_types import is_record
 
 
 def is_rule(value: Any) -> bool:

@@ -1,12 +1,12 @@
 """Let Numba pass named tuples of arrays by reference, as records.
 
-By default Numba passes a tuple by value. Each call of a rule would then take every array of `Worlds` and
-`Tables` apart into its pointer, shape and strides, some thousand numbers, which took four fifths of the time
-to compile.
+By default Numba passes a tuple by value. Each call of a rule would then take every array of the game's
+`Worlds` and `Tables` apart into its pointer, shape and strides, some thousand numbers, which took four fifths
+of the time to compile.
 
 A record is a pointer to the arrays of a named tuple. It is valid as long as the function that made it runs.
-Only the functions that drivers call make records, from their arguments and by `slicer`, and all rules become
-one piece of machine code with them.
+Only the functions that drivers call make records, from their arguments and by functions of
+`cprl.institutions.arrays.slicer`, and all rules become one piece of machine code with them.
 
 In the functions below, `context` and `builder` are Numba's target context and LLVM's builder of instructions,
 and a function returns the LLVM value of what its name says.
@@ -27,7 +27,7 @@ from numba.core.imputils import lower_getattr_generic
 from numba.core.typing.templates import AttributeTemplate
 from numba.extending import NativeValue, infer_getattr, intrinsic, models, register_model, unbox
 
-from cprl.institutions.arrays import Sliced, is_record
+from cprl.values.array_types import is_record
 
 VERSION: Final = sha256(Path(__file__).read_bytes()).hexdigest()[:16]
 """The hash of this file; compiled code depends on it, so it is part of the key of the cache."""
@@ -205,8 +205,13 @@ def with_local(entry: FunctionType, compiled: Any) -> FunctionType:
     return function
 
 
-def by_reference(sliced: Sliced) -> Any:
-    """Return the compiled replacement for a function made by `slicer`, which makes a record of world b."""
+def by_reference(sliced: tuple[Any, ...]) -> Any:
+    """Return the compiled replacement for a function made by `slicer`, which makes a record of world b.
+
+    Args:
+        sliced: what the function does with each entry of its named tuple: True if it takes world b out of it,
+            False if the entry stays as it is, and such a tuple if it is a named tuple itself.
+    """
 
     @intrinsic
     def one(context: Any, arrays: Any, b: Any) -> Any:
@@ -222,11 +227,11 @@ def by_reference(sliced: Sliced) -> Any:
     return one
 
 
-def _world_type(context: Any, sliced: Sliced, arrays: Any, b: Any) -> Any:
+def _world_type(context: Any, sliced: tuple[Any, ...], arrays: Any, b: Any) -> Any:
     """Return the type of the record of one world, from the types of the arrays of all worlds and of b."""
     entries = []
-    for kind, part in zip(arrays.entries, sliced.parts, strict=True):
-        if isinstance(part, Sliced) and not isinstance(kind, types.NoneType):
+    for kind, part in zip(arrays.entries, sliced, strict=True):
+        if isinstance(part, tuple) and not isinstance(kind, types.NoneType):
             entries.append(_world_type(context, part, kind, b))
         elif part is True:
             entries.append(_getitem(context, kind, b).return_type)
@@ -244,7 +249,7 @@ def _build_world(
     context: Any,
     target: Any,
     builder: Any,
-    sliced: Sliced,
+    sliced: tuple[Any, ...],
     arrays: Any,
     record: Any,
     pointer: Any,
@@ -257,10 +262,10 @@ def _build_world(
     of the index b.
     """
     values = []
-    for number, part in enumerate(sliced.parts):
+    for number, part in enumerate(sliced):
         kind = arrays.entries[number]
         value = _load_entry(target, builder, arrays, pointer, number)
-        if isinstance(part, Sliced) and not isinstance(kind, types.NoneType):
+        if isinstance(part, tuple) and not isinstance(kind, types.NoneType):
             value = _build_world(
                 context, target, builder, part, kind, record.entries[number], value, b, b_value
             )
