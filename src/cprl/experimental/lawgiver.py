@@ -34,12 +34,7 @@ class Lawgiver(Model, stored=False):
         """
 
         def read(answer: Any) -> Game:
-            institutions = from_config(answer.get("institutions"), "institutions")
-            if not isinstance(institutions, tuple) or not all(
-                isinstance(one, Institution) for one in institutions
-            ):
-                raise ValueError("institutions is no list of institutions")
-            return replace(game, institutions=institutions)
+            return replace(game, institutions=from_config(answer.get("institutions"), "institutions"))
 
         metrics = [f"- {name}: {value:.4g}" for name, value in metrics_of(table).items()]
         prompt = "\n".join([f"Institutions now: {rules_of(game) or NO_RULES}.", "What came of it:", *metrics])

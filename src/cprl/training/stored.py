@@ -29,7 +29,7 @@ from cprl.policies.asking import CALLS, Calls
 from cprl.policies.decisions import ballot_sizes, stored_decisions
 from cprl.policies.governors import GovernorActor, Script, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
-from cprl.policies.language import LanguageActor
+from cprl.policies.language import LanguageActor, Said
 from cprl.policies.rng import LaneRng, Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
 from cprl.population import (
@@ -473,6 +473,7 @@ def stored_actors(
     indices_by_kind: dict[Any, list[int]] = {}
     spaces = playing.spaces if isinstance(playing, Game) else playing
     actors: dict[ActorAgents, nn.Module] = {}
+    said: Said = {}
     for agent in sorted(agents):
         replicas = agents[agent]
         if replicas[0].pool:
@@ -492,7 +493,9 @@ def stored_actors(
         size: dict[str, Any] = {"seeds": seeds(agents=indices), "agents": len(indices), "worlds": worlds}
         stored = lanes[0]
         if stored.language is not None and stored.calls is not None:
-            actors[tuple(indices)] = LanguageActor(stored.language, playing, calls=stored.calls, **size)
+            actors[tuple(indices)] = LanguageActor(
+                stored.language, playing, calls=stored.calls, said=said, **size
+            )
             continue
         if stored.scripted is not None:
             actors[tuple(indices)] = scripted_lanes(stored.scripted, playing, **size)
