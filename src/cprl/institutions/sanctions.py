@@ -79,13 +79,8 @@ class GraduatedSanctions(Institution):
     def needs_tags(self) -> bool:
         return self.on == "tags"
 
-    @property
-    def highest_level(self) -> int:
-        """Return the level from which on sanctions grow no more."""
-        return max(np.shape(self.freeze_steps)[-1], len(self.fines)) - 1
-
     def check_choices(self, name: str, choices: Sequence[float]) -> None:
-        highest = self.highest_level
+        highest = max(np.shape(self.freeze_steps)[-1], len(self.fines)) - 1
         if choices[-1] > highest or any(choice % 1 for choice in choices):
             raise ValueError(
                 f"{name} is {tuple(choices)}; allowed for these GraduatedSanctions: levels, whole numbers in "

@@ -71,8 +71,8 @@ class Governing:
         """The loss of the last update of each replica, [R, 1]; NaN before the first."""
 
     def store(self, turn: Turn) -> None:
-        """Count a turn; at the end of a period store its transitions and learn."""
-        if self.actor.seen is None:
+        """Count a turn, and learn at the end of a period, if the governor learns."""
+        if self.learner is None or self.actor.seen is None:
             return
         now = {name: _copied(turn.next_world[name]) for name in _AT_THE_LAST}
         paid = [_copied(turn.next_agents[key[-1]]) for key in (keys.HARVEST, keys.FINES, keys.TRANSFERS)]
@@ -86,18 +86,17 @@ class Governing:
                 entry[ended] = self._period[name][ended]
         self._period = now
         if self.actor.turns % self._governor.every_steps == 0:
-            self._end_period()
+            self._learn(self.learner)
+            self._period = {}
 
-    def _end_period(self) -> None:
-        """Learn from a period, and forget it."""
-        if self.learner is not None:
-            batch = self._transitions()
-            self.learner.store(batch)
-            loss = self.learner.update()
-            self.learner.end_episode(batch["next", keys.DONE][:, 0])
-            if loss is not None:
-                self._loss = loss.cpu()
-        self._period = {}
+    def _learn(self, learner: Learner) -> None:
+        """Learn from the period that has ended."""
+        batch = self._transitions()
+        learner.store(batch)
+        loss = learner.update()
+        learner.end_episode(batch["next", keys.DONE][:, 0])
+        if loss is not None:
+            self._loss = loss.cpu()
 
     def _transitions(self) -> TensorDict:
         """Return the period as a turn of agents of which the last is the governor."""
