@@ -6,9 +6,13 @@ Whole steps and updates alone take turns within one process; the best of several
 of their ratio, turn by turn, the median, since whatever else the machine does falls on both:
 inside a training an update finds its numbers, and everything its code, pushed out of the fast caches.
 
+Last comes the time of a turn with a governor that learns by PPO, as a multiple of one with a vote: four
+agents in 16 worlds of 8 replicas, an update of the governor in every 200 turns.
+
     make bench
 """
 
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -25,15 +29,18 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from cprl import CommonsEnv, presets
-from cprl.algorithms import DQN
+from cprl import CommonsEnv, Experiment, presets
+from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
 from cprl.algorithms.base import TrainingEngine
+from cprl.institutions import Governor, Institution, Tax, Vote
 from cprl.learners.lanes import Lanes
 from cprl.learners.learner import Learner
 from cprl.measuring.tracker import EpisodeTracker
 from cprl.policies.joint_policy import JointPolicy
+from cprl.population import Learning
 from cprl.system.process import prepare_process
 from cprl.training import Schedule, Training
+from cprl.training.evaluating import make_agents
 
 CASES: Final[tuple[tuple[presets.Board, int, int], ...]] = (
     ("single_complex", 1, 1),
@@ -49,6 +56,11 @@ PARTS: Final[dict[str, tuple[type, str]]] = {
     "tracking": (EpisodeTracker, "add"),
 }
 STEPS: Final = 200
+WORLDS: Final = 16
+"""The worlds of each replica in trainings with a governor or a vote."""
+DEAR: Final = 1.1
+"""The multiple of a turn with a vote above which a turn with a governor costs more than is allowed."""
+BY_PPO: Final = Learning(PPO(settings=RolloutSettings(rollout_steps=4, minibatch_size=64)))
 
 
 def timed(part: str, spent: Counter[str]) -> AbstractContextManager[Any]:
@@ -109,8 +121,42 @@ def measure(
     return best
 
 
+def ruled(institutions: tuple[Institution, ...], engine: TrainingEngine, **governor: Any) -> Training:
+    """Return a training of a game with some institutions, after its first turns."""
+    settings = DQNSettings(buffer_size=20_000, batch_size=64, steps_per_update=WORLDS)
+    experiment = Experiment(
+        name="step",
+        game=replace(presets.game("commons"), institutions=institutions),
+        agents=(Learning(DQN(settings=settings)),) * 4,
+        steps=10**9,
+        replicas=8,
+        worlds=WORLDS,
+        engine=engine,
+        **governor,
+    )
+    env, population = make_agents(experiment)
+    training = Training(
+        env,
+        population.learners,
+        experiment.schedule,
+        decisions=population.decisions,
+        governor=population.governor,
+    )
+    while training.steps < 500 * WORLDS:
+        training.step()
+    return training
+
+
+def measure_governor(repeats: int, engine: TrainingEngine) -> float:
+    """Return the time of a turn with a governor, as a multiple of one with a vote."""
+    prepare_process(0)
+    voting = ruled((Vote(on=Tax()),), engine)
+    governed = ruled((Tax(), Governor(sets="tax.rate")), engine, governor=BY_PPO)
+    return median(seconds(governed.step) / seconds(voting.step) for _ in range(repeats))
+
+
 def main(*, repeats: int = 15, engine: TrainingEngine = "compiled") -> None:
-    """Print the table.
+    """Print the table; end with exit code 1 where a governor costs more than is allowed.
 
     Args:
         repeats: of which the best counts.
@@ -122,6 +168,7 @@ def main(*, repeats: int = 15, engine: TrainingEngine = "compiled") -> None:
         for board, agents, replicas in CASES:
             columns.append(process.submit(measure, board, agents, replicas, repeats, engine).result())
             table.add_column(f"{agents * replicas} lanes", justify="right")
+        governor = process.submit(measure_governor, repeats, engine).result()
     for part in PARTS:
         table.add_row(
             part, *(f"{best[part]:,.0f} ({best[part] / best['whole step']:.0%})" for best in columns)
@@ -133,6 +180,9 @@ def main(*, repeats: int = 15, engine: TrainingEngine = "compiled") -> None:
     table.add_row("update alone", *(f"{best['update alone']:,.0f}" for best in columns))
     table.add_row("whole step / update alone, median", *(f"{best['ratio']:.2f}" for best in columns))
     Console().print(table)
+    Console().print(f"a turn with a governor / with a vote, median: {governor:.2f}")
+    if governor > DEAR:
+        sys.exit(f"more than {DEAR} of a turn with a vote")
 
 
 if __name__ == "__main__":

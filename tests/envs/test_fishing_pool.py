@@ -1,5 +1,8 @@
 """The pool of GovSim: what is left doubles, the last units go by lot, its measures are worked by hand."""
 
+import json
+from dataclasses import replace
+
 import pytest
 import torch
 from fishing_pool import MEASURES, FishingPool
@@ -43,13 +46,26 @@ def test_it_is_an_environment():
 def test_ten_each_last_for_ever_and_twenty_each_one_round():
     episode = asking(10, 10, 10, 10, 10)  # 100 - 50 = 50, which double to 100, twelve times
     assert episode.harvest.tolist() == [120] * 5
-    assert measured(episode) == [12, 1, 1]
+    assert measured(episode) == [12, 1, 1, 0]
     assert episode.metrics["equality"] == 1
     episode = asking(20, 20, 20, 20, 20)
-    assert measured(episode) == [1, 0, 100 / 600]
+    assert measured(episode) == [1, 0, 100 / 600, 1]
     episode = asking(12, 12, 12, 12, 12)  # 40 -> 80, 20 -> 40, then 40 of 60 that are wanted
     assert measured(episode)[:2] == [3, 0]
     assert episode.harvest.sum() == 60 + 60 + 40
+
+
+def test_over_usage_counts_who_takes_more_than_an_equal_share_of_what_regrows():
+    episode = asking(11, 10, 9, 0, 0)  # 70 are left, which are 100 again, twelve times
+    assert measured(episode) == [12, 1, 30 / 50, 1 / 5]
+    assert episode.violations.tolist() == [12, 0, 0, 0, 0]
+    episode = asking(30, 9, 9, 1, 1)  # 100 -> 50 -> 100: shares of 10
+    assert episode.violations.tolist() == [12, 0, 0, 0, 0]
+    episode = asking(
+        0, 0, 20, 20, 20
+    )  # 100 -> 80 -> 40: shares of 10, 8 and 4; then 40 of 60 that are wanted
+    assert episode.steps == 3
+    assert episode.metrics["over_usage"] == 3 / 5
 
 
 def test_below_five_units_the_pool_has_collapsed_and_with_five_it_has_not():
@@ -87,6 +103,32 @@ def test_language_agents_fish_among_others_and_say_numbers():
     assert table["harvest"].to_pylist() == [120] * 10
 
 
+def test_with_talk_all_others_read_in_the_next_round_what_an_agent_says():
+    def answer(request):
+        prompt = request["messages"][1]["content"]
+        heard = prompt.partition("Turn")[0].splitlines()
+        return json.dumps({"action": 10, "message": f"{heard[0][:-1]}, {len(heard) - 1} spoke"})
+
+    with served(answer) as server:
+        young = language(server.url, every_steps=1, fallback="random", instructions=POOL.about)
+        old = replace(young, instructions="You are old.")  # an actor of its own
+        agents = (young, old, young, Scripted(), young)
+        play_population(replace(POOL, talk=True), agents, Fresh(episodes=1, replicas=(0,)))
+        prompts = [request["messages"][1]["content"] for request in server.requests]
+        assert '"message" is a text' in server.requests[0]["messages"][0]["content"]
+    firsts = [prompt for prompt in prompts if "Turn 1." in prompt]
+    assert sorted(prompt.splitlines()[0] for prompt in firsts) == [
+        f"You are agent {n}." for n in (0, 1, 2, 4)
+    ]
+    assert {len(prompt.splitlines()) for prompt in firsts} == {2}, (
+        "nobody has spoken, in whatever order they act"
+    )
+    (second,) = [prompt for prompt in prompts if "Turn 2." in prompt and "You are agent 2." in prompt]
+    assert second.splitlines()[1:-1] == [
+        f'Agent {agent} says: "You are agent {agent}, 0 spoke"' for agent in (0, 1, 4)
+    ]
+
+
 @pytest.mark.integration
 def test_learning_agents_train_in_it(tmp_path):
     experiment = cprl.Experiment(
@@ -103,4 +145,5 @@ def test_learning_agents_train_in_it(tmp_path):
         "rounds_survived",
         "has_survived",
         "share_of_optimum",
+        "over_usage",
     }

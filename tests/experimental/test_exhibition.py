@@ -17,14 +17,17 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 from watched import ALONE, DQN_AGENT, REPLAY, ROLLOUT, population_of
 
-from cprl import Game, River, Rules, maps
-from cprl.algorithms import MAPPO
+from cprl import Game, River, Rules, keys, maps
+from cprl.algorithms import MAPPO, PPO
 from cprl.experimental import exhibition
 from cprl.experimental.current_policy import FirstReplica
 from cprl.experimental.exhibition import BATCH_S, BATCH_STEPS, Exhibition, policy_and_world
-from cprl.population import Scripted, Team
+from cprl.institutions import Governor, Tax
+from cprl.measuring.playing import turns
+from cprl.policies.governors import Constant
+from cprl.population import Learning, Scripted, Team
 from cprl.training import Schedule, train
-from cprl.training.evaluating import fresh_env, random_play
+from cprl.training.evaluating import fresh_env, make_agents, random_play
 from cprl.viewer.callback import ViewerCallback
 from cprl.viewer.live import Stream
 from cprl.viewer.scene import plotted_numbers, scene_of
@@ -163,6 +166,25 @@ def test_the_current_policy_acts_in_its_replica_as_in_evaluation(name):
             for _ in range(20):
                 moment = TensorDict({"observation": seen[:1]}, [1])
                 assert torch.equal(alone(moment)["action"], of_all.choose(seen)[:1])
+
+
+@pytest.mark.parametrize("governor", [Constant(1.0), Learning(PPO(settings=ROLLOUT))], ids=["script", "ppo"])
+def test_the_governor_of_the_first_replica_governs_the_world_that_is_shown(governor):
+    rate = Governor(sets="tax.rate", options=(0.0, 0.5, 1.0), every_steps=5)
+    game = replace(ALONE.game, institutions=(Tax(), rate))
+    experiment = replace(ALONE, transforms=[], game=game, governor=governor)
+    _, population = make_agents(experiment)
+    if isinstance(governor, Learning):
+        (logits,) = (
+            weight
+            for weight in population.governor.learner.lane_networks.params.values()
+            if weight.numel() == 2 * 3
+        )
+        logits.view(2, 3)[:] = torch.tensor([[0.0, 0.0, 99.0], [99.0, 0.0, 0.0]])
+    policy, world = policy_and_world(experiment, population)
+    with policy.apart():
+        rates = [float(batch["next", keys.IN_FORCE][0, 0]) for batch in turns(world, policy)]
+    assert set(rates) == {1.0}
 
 
 def test_it_plays_ten_to_twelve_steps_a_second_however_often_the_training_asks(kept):

@@ -242,7 +242,7 @@ def test_what_governs_is_made_of_the_committed_tables_and_its_pages_have_their_n
         assert (tmp_path / name).read_text() == (results / "governs" / name).read_text()
     anew = (
         *("changes", "tax_rate", "quota_size", "oversight", "best_response", "in_motion", "order"),
-        *("shocks", "governor", "governor_kept"),
+        *("shocks", "governor", "governor_kept", "governor_gamed"),
     )
     studies = (*anew, "elsewhere", "many_worlds")
     folders = [results / "governs", *(results / "studies" / study for study in studies)]

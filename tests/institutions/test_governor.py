@@ -7,7 +7,8 @@ from boards import Play
 from torchrl.envs.utils import check_env_specs
 
 from cprl import CommonsEnv, Custom, Game, Rules, keys, maps
-from cprl.institutions import Governor, Quota, Tax, Vote
+from cprl.institutions import Boundaries, Governor, GraduatedSanctions, Quota, Tax, Vote
+from cprl.measuring import social
 from cprl.measuring.registry import (
     INSTITUTION_ENTRIES,
     OPTIONAL_ENTRIES,
@@ -57,6 +58,37 @@ def test_a_quota_whose_window_opens_with_the_turn_has_the_new_share():
     assert play.batch.law.quotas.allowed[0, 0] == 0.5 * unit, "the window of the third turn"
 
 
+OUTSIDE = Boundaries.drawn("........\n...0....", step_fine=1.0)
+BOARD = "A.......\n>..^...."
+"""Agent 1 stands in the region of agent 0, in the beam of agent 0."""
+LEVEL = Governor(sets="sanctions.level", options=(0.0, 1.0, 2.0), every_steps=2)
+
+
+@pytest.mark.parametrize(
+    ("on", "acts", "fines"),
+    [("violations", ("stay", "stay"), [11, 3, 21, 21]), ("tags", ("beam", "stay"), [10, 2, 20, 20])],
+)
+def test_a_governor_sets_the_level_of_a_first_offence(on, acts, fines):
+    sanctions = GraduatedSanctions(freeze_steps=(0,), fines=(2, 10, 20), recovery_steps=None, on=on)
+    play = Play(BOARD, institutions=[OUTSIDE, sanctions, LEVEL] if on != "tags" else [sanctions, LEVEL])
+    paid = [
+        ruled(play.again(), 1).turn(*acts).fines[1],
+        ruled(play.again(), 0).turn(*acts).fines[1],
+        ruled(play, 1).turn(*acts).fines[1],  # the second offence, one level higher
+        ruled(play, 2).turn(*acts).fines[1],  # there is no higher level
+    ]
+    assert paid == fines
+
+
+def test_agents_miss_as_many_turns_as_the_level_in_force_says_and_see_it():
+    sanctions = GraduatedSanctions(freeze_steps=(1, 3, 5), fines=(0,), recovery_steps=None, on="tags")
+    play = Play(BOARD, worlds=2, institutions=[sanctions, LEVEL])
+    ruled(play, 1, 2).turn("beam", "stay")
+    assert play.batch.now.out_steps[:, 1].tolist() == [3, 5]
+    assert play.shown(2)[1] == [255, 128], "level 1 in force, and level 2 comes next"
+    assert [ballot.title for ballot in play.game.in_force] == ["the level of a first offence"]
+
+
 def test_agents_vote_on_one_thing_and_the_governor_sets_another():
     governor = Governor(sets="quota.share", options=(0.25, 0.75), every_steps=2)
     play = Play(ROW, institutions=[governor, Quota(), Vote(on=LOST, choices=(0.0, 0.5))], regrow_prob=(0.5,))
@@ -87,6 +119,16 @@ def test_the_environment_reads_the_rule_and_shows_what_can_be_seen():
         env.step(moment.set(keys.RULE, torch.tensor([0, 3])))
 
 
+def test_a_governor_sees_the_equality_of_the_harvests_of_the_episode_so_far():
+    sight = Governor(sets="tax.rate", sees=("equality", "time"))
+    apples = np.array([[3, 1, 0], [0, 0, 0], [2, 2, 2]])
+    steps = np.array([4, 0, 2])
+    seen = sight.see(apples[:, 0] / 9, steps, apples, apples * 0, 8)
+    assert seen[:, 1].tolist() == [0.5, 0.0, 0.25]
+    assert seen[1, 0] == 1, "nobody has less than another"
+    assert seen[::2, 0].tolist() == pytest.approx(social.equality(apples[::2]).tolist())
+
+
 STOCKS = torch.tensor([[0.0], [0.3], [0.5], [1.0]])
 
 
@@ -95,6 +137,7 @@ STOCKS = torch.tensor([[0.0], [0.3], [0.5], [1.0]])
     [
         (StockRule(), "quota.share", [0, 1, 1, 2]),
         (StockRule(), "tax.rate", [2, 1, 1, 0]),
+        (StockRule(), "sanctions.level", [2, 1, 1, 0]),
         (StockRule(lower=0.4, upper=0.6), "quota.share", [0, 0, 1, 2]),
         (Constant(0.5), "tax.rate", [1, 1, 1, 1]),
     ],
@@ -165,6 +208,9 @@ def test_an_episode_has_the_mean_of_what_was_in_force_and_the_objective_of_the_w
         ("options", Governor(sets="tax.rate", options=(0.5, 1.5)), [Tax()]),
         ("every_steps", Governor(sets="tax.rate", every_steps=11), [Tax()]),
         ("Governor", RATE, [Tax(), RATE]),
+        ("sets", LEVEL, [Tax()]),
+        ("options", LEVEL, [GraduatedSanctions(freeze_steps=(1, 2), fines=(0, 1))]),
+        ("options", Governor(sets="sanctions.level", options=(0.0, 0.5)), [GraduatedSanctions()]),
     ],
 )
 def test_a_governor_that_the_game_does_not_fit_is_refused(field, governor, others):

@@ -1,7 +1,7 @@
 """How institutions are put together: every rule of theirs is called, and none takes another's name."""
 
 from types import FunctionType
-from typing import get_args, get_type_hints
+from typing import Annotated, NamedTuple, get_args, get_type_hints
 
 import permits
 import pytest
@@ -10,9 +10,10 @@ from boards import Play
 from cprl.commons import apples, loops, threads, world
 from cprl.commons.rules import GROUPS
 from cprl.institutions import Tax, hooks, ledger
-from cprl.institutions.arrays import InState, filled
+from cprl.institutions.arrays import IN_STATE, InState, filled
 from cprl.institutions.law import MODULES
 from cprl.system.jit.compiled import PLAIN_RULES, RULES_VARIABLE
+from cprl.values.array_types import Int32
 
 TOGETHER = (world, *GROUPS.values(), ledger, *MODULES.values(), permits)
 
@@ -48,6 +49,16 @@ def claimed(module):
                 if any(isinstance(mark, InState) for mark in get_args(hint)):
                     yield name
             yield from map("entry {}".format, getattr(kind, "entries", ()))
+
+
+class Remembered(NamedTuple):
+    times: int
+    taken_step: Annotated[Int32, "B K times", IN_STATE]
+
+
+def test_an_axis_may_have_the_length_of_a_number_beside_it():
+    remembered = filled(Remembered, {"times": 4}, B=2, K=3)
+    assert remembered.taken_step.shape == (2, 3, 4)
 
 
 def test_no_two_modules_claim_a_name_of_the_state_or_of_an_entry_shown_to_agents():

@@ -93,6 +93,49 @@ def test_agents_learn_by_the_rate_of_their_step_and_no_more_when_it_is_0(setting
             assert any(not torch.equal(*pair) for pair in again) is False
 
 
+@pytest.mark.parametrize("algorithm", [A2C, PPO, IPPO, MAPPO])
+def test_the_weight_of_the_entropy_falls_along_a_line_and_stays_at_its_end(algorithm):
+    falls = algorithm(settings=ROLLOUTS, entropy_coeff=0.5, entropy_coeff_end=0.1, entropy_decay_steps=40)
+    weights = [falls.entropy_coeff_at(step) for step in (0, 10, 20, 40, 90)]
+    assert weights == pytest.approx([0.5, 0.4, 0.3, 0.1, 0.1])
+    assert replace(falls, entropy_coeff_end=None).entropy_coeff_at(40) == 0.5
+    with pytest.raises(ValueError, match="entropy_coeff_end"):
+        replace(falls, entropy_coeff=0.0)
+
+
+@pytest.mark.parametrize(
+    ("algorithm", "engine"),
+    [
+        *((PPO, "eager"), (PPO, "torchrl"), (A2C, "eager"), (IPPO, "eager"), (MAPPO, "eager")),
+        pytest.param(PPO, "compiled", marks=pytest.mark.integration),
+    ],
+)
+def test_agents_learn_with_the_weight_of_the_entropy_of_their_step(algorithm, engine):
+    """Two updates, of which the second has another weight: as with that weight from a state on."""
+    is_team = algorithm in (IPPO, MAPPO)
+    lanes = {"engine": engine, "are_teams": is_team, "reward": "team" if algorithm is MAPPO else "individual"}
+
+    def made(**entropy):
+        whole = algorithm(settings=ROLLOUTS, **entropy)
+        return parts.make_learner(whole, GAME.spaces, agents=(0, 1), replicas=2, seed=7, **lanes)
+
+    falling = made(entropy_coeff=2.0, entropy_coeff_end=0.0, entropy_decay_steps=16)
+    played(falling, 15)
+    none = made(entropy_coeff=0.0)
+    some = made(entropy_coeff=2.0)
+    for other, weight in ((none, 0.0), (some, 2.0)):
+        other.load_state_dict(deepcopy(falling.state_dict()))
+        other.lane_networks.set_entropy_coeff(weight)
+    for each in (falling, none, some):
+        played(each, 1)
+    ends = [
+        [weight for network in each.networks().values() for weight in network.state_dict().values()]
+        for each in (falling, none, some)
+    ]
+    torch.testing.assert_close(ends[0], ends[1], rtol=1e-5, atol=1e-6)
+    assert any(not torch.allclose(*pair, rtol=1e-4) for pair in zip(ends[0], ends[2], strict=True))
+
+
 def test_a_turn_of_several_worlds_is_as_many_steps_of_the_fall():
     falls = replace(REPLAY, learning_rate_end=0, learning_rate_decay_steps=80)
     made = learner(falls, replicas=1, worlds=4)

@@ -113,6 +113,15 @@ def test_a_server_that_is_not_there_or_refuses_all_is_named_before_anything_is_k
     assert not (tmp_path / CALLS).exists()
 
 
+def test_a_server_that_goes_away_is_no_crash_for_calls_at_the_same_time():
+    calls = Calls()
+    with served(by_seed) as server:
+        model = Model(base_url=server.url, **QUICK, concurrency=16)
+        assert calls.ask(model, [question(0)], number_in) == [0]
+    answers = calls.ask(model, [question(number) for number in range(200)], number_in)
+    assert answers == [0] + [None] * 199
+
+
 def test_the_key_is_sent_and_never_kept(tmp_path, monkeypatch):
     monkeypatch.setenv("A_KEY", "sesame")
     with served(by_seed) as server:
@@ -124,6 +133,23 @@ def test_the_key_is_sent_and_never_kept(tmp_path, monkeypatch):
         calls.ask(Model(base_url=server.url, **QUICK), [question(1)], number_in)
         assert "Authorization" not in server.headers[1]
     assert "sesame" not in (tmp_path / CALLS).read_text() + repr(model)
+
+
+def test_what_calls_cost_is_kept_and_said_where_prices_are(tmp_path):
+    with served(by_seed) as server:
+        calls = Calls()
+        calls.keep_in(tmp_path / CALLS)
+        model = Model(base_url=server.url, **QUICK, prices=(0.5, 20), max_calls=1000)
+        calls.ask(model, [question(0), question(1)], number_in)
+        # 100 tokens of a prompt and 20 of an answer: 0.00005 + 0.0004 dollars
+        assert [call["dollars"] for call in read_calls(tmp_path / CALLS).values()] == [0.00045] * 2
+        words = "0 without a usable answer, 0.0009 US dollars (1,000 such calls: 0.45)"
+        assert calls.in_words() == f"2 calls, 200 + 40 tokens, {words}"
+        resumed = Calls()
+        resumed.keep_in(tmp_path / CALLS)
+        assert resumed.in_words().endswith("0.0009 US dollars")
+    with pytest.raises(ValueError, match=r"Model\.prices"):
+        Model(model="small", prices=(-1, 2))
 
 
 def test_a_stored_run_answers_without_a_network_and_a_changed_prompt_is_refused_by_name(tmp_path):

@@ -19,7 +19,7 @@ from cprl.policies.asking import Calls
 from cprl.policies.joint_policy import JointPolicy
 from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_seeds
-from cprl.policies.scripted import scripted_lanes
+from cprl.policies.scripted import ScriptedActor, scripted_lanes
 from cprl.population import Scripted
 from cprl.values import from_config, to_config
 
@@ -129,6 +129,11 @@ def test_a_model_is_shown_the_rules_and_all_that_its_agent_observes():
         '{"policy": "greedy", "spare": 1.5}',
         '{"policy": "greedy", "signal": 1}',
         '{"policy": "greedy", "whom": 1}',
+        '{"policy": "greedy", "region": [3, 1]}',
+        '{"policy": "greedy", "region": [1]}',
+        '{"policy": "greedy", "region": [-1, 1]}',
+        '{"policy": "greedy", "tag": [1]}',
+        '{"policy": "greedy", "message": "pick less"}',
         '{"policy": ["greedy"]}',
         '{"policy": {"kind": "Custom", "target": "os:getcwd"}}',
         '{"spare": 1}',
@@ -145,6 +150,79 @@ def test_a_plan_that_is_not_allowed_is_the_fallback_that_was_said(answer):
         assert f"{len(server.requests)} without a usable answer" in actor._calls.in_words()
     script = scripted_lanes("aggressive", GAME, seeds=seeds, agents=GAME.agents)
     assert torch.equal(fallen, played(GAME, script))
+
+
+def test_a_plan_says_where_an_agent_harvests_and_whom_it_tags():
+    board = Game(
+        map=maps.parse("...A.\n..A..\n>.<.>\n.....\n..^..\n....A"),
+        rules=replace(RULES, window_rows=5, beam_length_cells=4),
+        observation=Observation(agents_apart=True),
+    )
+    plan = {"policy": "aggressive", "region": [2, 0], "tag": [1]}
+    with served(lambda request: json.dumps(plan)) as server:
+        actor = actor_for(board, language(server.url))
+        planned = played(board, actor)
+        system = server.requests[0]["messages"][0]["content"]
+        assert '"region": [4, 2], "tag": [1]}' in system
+        assert "0 agent_0, 1 agent_1" in prompts(server)[0]
+        assert "Your last plan: aggressive, spare 3, region 2, 0, tag [1]." in prompts(server)[-1]
+    seeds = lane_seeds(1, replicas=[0], agents=range(4), purpose=Purpose.EVALUATION)
+    script = ScriptedActor("aggressive", board, seeds=seeds, agents=4, region=(2, 0), tag=(1,))
+    assert torch.equal(planned, played(board, script))
+    assert not torch.equal(planned, played(board, ScriptedActor("aggressive", board, seeds=seeds, agents=4)))
+    for region, tag in (([5, 0], [1]), ([0, 3], [1]), ([0, 0], [4])):
+        with pytest.raises(ValueError, match="allowed"):
+            actor._answers.read({"policy": "greedy", "region": region, "tag": tag})
+
+
+def test_a_message_is_read_by_all_other_agents_of_the_world_from_the_next_turn_on_and_in_its_episode_alone():
+    game = replace(GAME, rules=replace(RULES, signals=1, episode_steps=9, plays_on_when_empty=True))
+    seeds = lane_seeds(1, replicas=[0, 1], agents=range(4), purpose=Purpose.EVALUATION)
+
+    def answer(request):
+        return json.dumps({"policy": "greedy", "message": f"</script>\n{request['seed']}"})
+
+    with served(answer) as server:
+        calls = Calls()
+        said = {}
+        actors = {
+            agents: LanguageActor(
+                language(server.url, every_steps=every_steps),
+                game,
+                calls=calls,
+                seeds=[seed for seed in seeds if seed[2] in agents],
+                agents=len(agents),
+                worlds=2,
+                said=said,
+            )
+            for agents, every_steps in (((0, 2), 2), ((1, 3), 3))
+        }
+        env = CommonsEnv(game, 4, seed=2)
+        for _ in range(2):
+            list(turns(env, JointPolicy(actors)))
+    by_turn = {}  # replica and world, agent, episode and turn -> what was read, what was said
+    for call in calls.kept.values():
+        place, _, number = call["call"].partition(", agent ")
+        agent, number = number.split(", call ")
+        prompt = call["request"]["messages"][1]["content"]
+        heard = prompt[: prompt.index("Turn ")].splitlines()
+        assert heard[0] == f"You are agent {agent}."
+        turn = int(prompt[prompt.index("Turn ") :].split()[1])
+        every_steps = 2 if int(agent) % 2 == 0 else 3
+        episode = int(number) // -(-9 // every_steps)
+        by_turn[place, int(agent), episode, turn] = heard[1:], json.loads(call["answer"])["message"]
+    assert len(by_turn) == 4 * 2 * (2 * 5 + 2 * 3)
+    for (place, listener, episode, turn), (heard, _) in by_turn.items():
+        expected = []
+        for agent in {0, 1, 2, 3} - {listener}:
+            earlier = [
+                (when, message)
+                for (where, speaker, which, when), (_, message) in by_turn.items()
+                if (where, speaker, which) == (place, agent, episode) and when < turn
+            ]
+            if earlier:
+                expected.append(f"Agent {agent} says: {json.dumps(max(earlier)[1])}")
+        assert heard == expected
 
 
 def test_language_agents_play_beside_others_in_fresh_worlds_and_are_what_they_were_when_asked_again():

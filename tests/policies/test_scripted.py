@@ -30,10 +30,15 @@ class Stays(nn.Module):
 class Scene(Play):
     """A drawn board on which agent 0 follows a policy and all others stay; played through CommonsEnv."""
 
-    def __init__(self, drawing, policy, *, worlds=1, seed=0, spare=3, **rules):
-        self.game = Game(map=maps.parse(drawing), rules=Rules(**{"regrow_prob": (0.0,), **rules}))
+    def __init__(self, drawing, policy, *, worlds=1, seed=0, spare=3, region=None, tag=None, **rules):
+        self.game = Game(
+            map=maps.parse(drawing),
+            rules=Rules(**{"regrow_prob": (0.0,), **rules}),
+            observation=Observation(agents_apart=tag is not None),
+        )
         seeds = [(seed, world) for world in range(worlds)]
-        actor = ScriptedActor(policy, self.game, seeds=seeds, agents=1, spare=spare)
+        numbers = {"spare": spare, "region": region, "tag": tag}
+        actor = ScriptedActor(policy, self.game, seeds=seeds, agents=1, **numbers)
         others = {agent: Stays(self.game.actions.index("stay")) for agent in range(1, self.game.agents)}
         self.policy = JointPolicy({(0,): actor, **others})
         self.env = CommonsEnv(self.game, worlds, seed=seed)
@@ -163,6 +168,63 @@ def test_pacifist_leaves_an_apple_that_another_agent_is_nearer_to(policy, goes):
     steps = scene.env.rollout(1, scene.policy)
     went = (steps["agents", "action"][:, 0, 0] == ACTIONS.index("right")).double().mean()
     assert went == goes
+
+
+def test_an_agent_harvests_in_its_region_alone_and_goes_around_other_apples():
+    drawing = "A...A\n..A..\n..^.."
+    assert Scene(drawing, "greedy", may_fire=False).go(1) == ["forward"]
+    scene = Scene(drawing, "greedy", worlds=16, region=(0, 2), may_fire=False)
+    scene.go(1)
+    assert scene.bitten == 0
+    assert scene.env.worlds.now.row[:, 0].min() == 2, "it turns before the apple ahead"
+    scene = Scene("A.A.\n..^.", "greedy", region=(2, 0), may_fire=False)
+    assert scene.go(2)[0] == "forward"
+    scene = Scene("....A\n.##..\n^#A..", "sustainable", spare=1, region=(1, 2), worlds=8, may_fire=False)
+    scene.go(60)
+    assert scene.env.output.stock[:, 0].tolist() == [2] * 8, "neither has one near it"
+
+
+@pytest.mark.parametrize(
+    ("policy", "tag", "fires"),
+    [
+        ("greedy", (1,), True),
+        ("greedy", (2,), False),
+        ("greedy", (), False),
+        ("aggressive", (2, 1), True),
+        ("aggressive", (2,), False),
+        ("aggressive", (), False),
+        ("territorial", (1,), True),
+        ("territorial", (2,), False),
+        ("pacifist", (1, 2), True),
+    ],
+)
+def test_an_agent_fires_at_those_whom_it_is_to_tag(policy, tag, fires):
+    scene = Scene(">..<A..\n......<", policy, tag=tag, window_rows=8, window_columns=9)
+    assert (scene.go(1) == ["beam"]) == fires
+    assert scene.in_play == [True, not fires, True]
+
+
+def test_aggressive_pursues_those_whom_it_is_to_tag():
+    scene = Scene(".A......\n^..<...<", "aggressive", tag=(2,), window_rows=8, window_columns=17)
+    assert scene.go(1) == ["turn_right"]
+    scene = Scene(".A..\n^..<", "aggressive", tag=(), window_rows=8, window_columns=17)
+    assert scene.go(2) == ["forward", "right"], "of whom there is none"
+
+
+@pytest.mark.parametrize(
+    ("numbers", "words"),
+    [
+        ({"region": (3, 0)}, r"region is \(3, 0\); allowed: \(an integer in 0..2, an integer in 0..1\)"),
+        ({"region": (0, 2)}, r"region is \(0, 2\)"),
+        ({"region": (1,)}, "region"),
+        ({"tag": (1,)}, r"tag is \(1,\); allowed without a beam and Observation.agents_apart: \(\)"),
+        ({"tag": (2,)}, r"tag is \(2,\); allowed: \(an integer in 0..1, ...\)"),
+    ],
+)
+def test_a_region_beyond_the_window_and_agents_that_are_not_there_or_look_alike_are_refused(numbers, words):
+    game = Game(map=maps.parse(">.A\n<.."), rules=Rules(window_rows=3, window_columns=3))
+    with pytest.raises(ValueError, match=words):
+        ScriptedActor("greedy", game, seeds=[(0,)], agents=1, **numbers)
 
 
 def test_two_agents_that_want_one_cell_wait_at_random_until_one_gets_it():

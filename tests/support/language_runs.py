@@ -12,6 +12,7 @@ from cprl.runs.checkpoints import Checkpointer
 BOARD = ".A>.A\n.A.A.\n..<.A\n>.A.<"
 RULES = Rules(regrow_prob=(0.0, 0.2), window_rows=3, window_columns=5, episode_steps=25, freeze_steps=2)
 GAME = Game(map=maps.parse(BOARD), rules=RULES)
+TALK = replace(GAME, rules=replace(RULES, signals=1))
 
 
 def language(url="http://127.0.0.1:9", **fields):

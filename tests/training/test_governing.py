@@ -13,6 +13,7 @@ from tiny_study import GAME, LEARNING, TINY
 import cprl
 from cprl import keys
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
+from cprl.evaluation.cross_play import crossplay
 from cprl.evaluation.film import film
 from cprl.evaluation.populations import play_population
 from cprl.institutions import Governor, Quota, Tax
@@ -22,6 +23,7 @@ from cprl.runs.episodes import read_episodes
 from cprl.studies import Study
 from cprl.system.defaults import Fresh
 from cprl.training.evaluating import make_agents
+from cprl.training.nan_check import NotFiniteError
 from cprl.training.training import Training
 
 GOVERNOR = Governor(sets="tax.rate", options=(0.0, 0.5, 1.0), every_steps=5)
@@ -126,6 +128,34 @@ def test_a_state_in_the_middle_of_a_period_is_resumed():
     assert repr(first.governor.state_dict()) == repr(second.governor.state_dict())
 
 
+@pytest.mark.parametrize("on_nan", ["stop", "continue"])
+def test_a_governor_whose_weights_are_nan_is_noticed_as_an_agent_is(on_nan):
+    class Breaks:
+        turns = 0
+
+        def on_step(self, batch):
+            self.turns += 1
+            if self.turns == 12:
+                next(iter(training.governor.learner.lane_networks.params.values()))[1] = torch.nan
+
+    training = training_of(replace(EXPERIMENT, governor=BY_PPO, on_nan=on_nan), Breaks())
+    message = "weights of agent 2 in replica 1 are not finite"
+    stops = pytest.raises(NotFiniteError, match=message)
+    with stops if on_nan == "stop" else pytest.warns(RuntimeWarning, match=message):
+        training.run()
+    assert [(one.what, one.replica, one.agent) for one in training.finite.reported] == [("weights", 1, 2)]
+
+
+@pytest.mark.integration
+def test_the_governor_of_the_background_agents_governs_in_cross_play(tmp_path):
+    runs = {}
+    for name, rate in (("free", 0.0), ("taxed", 1.0)):
+        runs[name] = cprl.run(replace(EXPERIMENT, governor=Constant(rate)), tmp_path / name, **QUIET)
+    table = crossplay(runs, Fresh(episodes=2, seed=40))
+    rules = zip(table["background"].to_pylist(), table["governor/rule"].to_pylist(), strict=True)
+    assert set(rules) == {("free", 0.0), ("taxed", 1.0)}
+
+
 @pytest.mark.integration
 def test_a_frozen_governor_meets_fresh_agents_and_plays_in_evaluations(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
@@ -193,8 +223,8 @@ def test_a_replica_alone_is_the_same_as_beside_others():
     alone = training_of(replace(experiment, replicas=1))
     for training in (both, alone):
         training.run()
-    weights = both.governor.networks()["replica_0/agent_2"].state_dict()
-    for name, weight in alone.governor.networks()["replica_0/agent_2"].state_dict().items():
+    weights = both.governor.learner.networks()["replica_0/agent_2"].state_dict()
+    for name, weight in alone.governor.learner.networks()["replica_0/agent_2"].state_dict().items():
         assert torch.allclose(weight, weights[name], atol=1e-6), name
 
 

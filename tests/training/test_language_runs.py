@@ -1,13 +1,15 @@
 """Runs of language agents: stored, killed, resumed, replayed without a network; equal bit for bit."""
 
+import json
 import os
 import signal
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 
 import pytest
-from language_runs import experiment, language, offline, run_language
+from language_runs import TALK, experiment, language, offline, run_language
 from model_server import plan, served
 from places import ROOT
 from same_runs import assert_same_training
@@ -15,9 +17,12 @@ from small_learners import ALGORITHMS
 
 import cprl
 from cprl import Fresh
+from cprl.evaluation.film import Style, film_video
 from cprl.policies.asking import CALLS, read_calls
 from cprl.population import Frozen, Learning, Scripted, learned
 from cprl.runs.export import export_results
+from cprl.web.report import report
+from cprl.web.show import show
 
 
 @pytest.fixture(scope="module")
@@ -99,18 +104,84 @@ def test_a_run_that_is_killed_resumes_and_asks_nothing_twice(finished, tmp_path)
     assert_same_training(run, tmp_path / "run")
 
 
+SCRIPT = "<script>alert(1)</script>"
+
+
+def talker(request):
+    """Answer a plan and a message that depend on what the agent has read, and on its seed."""
+    read = request["messages"][1]["content"].count("says")
+    return json.dumps({**json.loads(plan(request)), "message": f"{SCRIPT} {read} {request['seed']}"})
+
+
+@pytest.mark.integration
+def test_messages_are_what_they_were_after_a_stop_and_without_a_network_and_no_page_runs_them(tmp_path):
+    with served(talker) as server:
+        mute = replace(language(server.url, model=SCRIPT), instructions="You never listen.")
+        agents = (replace(mute, instructions="", every_steps=7),) * 3 + (mute,)
+        fields = {"game": TALK, "agents": agents, "episodes": 2, "replicas": 1}
+        quiet = {"watch": "off", "figures": False}
+        run = cprl.run(experiment(None, **fields), tmp_path / "run", **quiet)
+        prompts = [request["messages"][1]["content"] for request in server.requests]
+        assert any(f'Agent 3 says: "{SCRIPT} ' in prompt for prompt in prompts)
+        asked = len(prompts)
+
+        class Stops:
+            def on_step(self, batch):
+                if len(server.requests) - asked > 9:
+                    signal.raise_signal(signal.SIGINT)
+
+        with pytest.raises(KeyboardInterrupt):
+            cprl.run(experiment(None, **fields), tmp_path / "stopped", callbacks=[Stops()], **quiet)
+        assert asked + 9 < len(server.requests) < 2 * asked
+        cprl.run(experiment(None, **fields), tmp_path / "stopped", resume=True, **quiet)
+        assert len(server.requests) == 2 * asked
+        pages = [show(run, tmp_path / "show.html")[0], report(run, tmp_path / "report.html", episodes=1)]
+    calls = read_calls(run / CALLS)
+    assert_same_training(run, tmp_path / "stopped")
+    agents = tuple(offline(run, spec) for spec in agents)
+    cprl.run(experiment(None, **{**fields, "agents": agents}), tmp_path / "again", **quiet)
+    assert_same_training(run, tmp_path / "again")
+    assert {*read_calls(tmp_path / "again" / CALLS)} <= {*calls}
+    for page in pages:
+        assert SCRIPT not in page.read_text(encoding="utf-8")
+
+
+@pytest.mark.integration
+def test_language_agents_are_filmed_and_shown_and_play_in_cross_play(tmp_path):
+    with served() as server:
+        fields = {"episodes": 1, "replicas": 1}
+        runs = [tmp_path / name for name in ("planners", "greedy")]
+        cprl.run(experiment(language(server.url), **fields), runs[0], watch="off", figures=False)
+        scripts = experiment(None, agents=(Scripted("greedy"),) * 4, **fields)
+        cprl.run(scripts, runs[1], watch="off", figures=False)
+        asked = len(server.requests)
+        _, (filmed,) = film_video(runs[0], tmp_path / "film.gif", style=Style(width=240, fps=10))
+        assert len(server.requests) > asked
+        asked = len(server.requests)
+        _, (shown,) = show(runs[0], tmp_path / "show.html")
+        assert len(server.requests) == asked, "it shows the episode of the film"
+        assert shown.harvest.tolist() == filmed.harvest.tolist()
+        table = cprl.crossplay(runs, Fresh(episodes=1, seed=9))
+        assert len(server.requests) > asked
+        asked = len(server.requests)
+        assert cprl.crossplay(runs, Fresh(episodes=1, seed=9)).equals(table)
+        assert len(server.requests) == asked
+
+
 @pytest.mark.integration
 def test_progress_and_summary_count_calls_and_tokens_and_show_no_prompt_key_or_answer(
     tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setenv("A_KEY", "sesame")
     with served(lambda request: "no plan" if request["seed"] % 2 else plan(request)) as server:
-        run = run_language(language(server.url, key_variable="A_KEY"), tmp_path / "run")
+        spec = language(server.url, key_variable="A_KEY", prices=(100, 1000))
+        run = run_language(spec, tmp_path / "run")
     output = "".join(capsys.readouterr())
     calls = read_calls(run / CALLS).values()
     bad = sum(call["failure"] is not None for call in calls)
     tokens = f"{100 * len(calls):,} + {20 * len(calls):,} tokens"
     assert f"{len(calls)} calls, {tokens}, {bad} without a usable answer" in output
+    assert f"a usable answer, {0.03 * len(calls):,.4f} US dollars (10,000 such calls: 300.00)" in output
     for secret in ("sesame", "no plan", "You are one of", "point for you"):
         assert secret not in output
     everything = b"".join(path.read_bytes() for path in run.rglob("*") if path.is_file())

@@ -18,8 +18,11 @@ from hosted_runs import hosted as hosted_run
 
 import cprl
 from cprl import institutions, keys
+from cprl.algorithms import PPO, RolloutSettings
+from cprl.evaluation.fresh import fresh_episodes, record
 from cprl.measuring.playing import evaluate
-from cprl.population import Person, Scripted
+from cprl.policies.governors import Constant, StockRule
+from cprl.population import Frozen, Learning, Person, Scripted
 from cprl.runs.episodes import batches_in, read_episodes
 from cprl.runs.files import RunLockedError
 from cprl.training.agents import Population
@@ -30,7 +33,7 @@ from cprl.web.hosted_round import Journal
 NUMBERS = pa.schema({"number": pa.int64()})
 COLUMNS = (
     *("turn", "ms", "group", "agent", "person", "given", "action", "cell", "heading", "in_play", "harvest"),
-    *("reward", "fired", "tagged", "stock", "decision", "violated", "fines"),
+    *("reward", "fired", "tagged", "stock", "decision", "rule", "violated", "fines"),
 )
 TURNS = 6
 
@@ -155,6 +158,77 @@ def test_a_session_that_was_killed_goes_on_at_the_next_turn_with_the_same_seats(
     turns = Counter(rows(out / "round-1").turn.tolist())
     assert turns == dict.fromkeys(range(1, 13), 8)
     assert read_episodes(out / "round-1").num_rows == 8
+
+
+GOVERNED = replace(
+    small_game(episode_steps=TURNS, regrow_prob=(0.0,)),
+    institutions=(
+        institutions.Tax(redistribution="none"),
+        institutions.Governor(sets="tax.rate", options=(0.0, 0.5, 1.0), every_steps=2),
+    ),
+)
+
+
+def test_a_governor_governs_people_and_what_they_played_is_replayed(tmp_path, monkeypatch):
+    plan = session(GOVERNED, groups=2, agents=("greedy",), governor=StockRule(lower=0.7))
+    with hosted(tmp_path / "out", plan, monkeypatch) as hall:
+        players = [Player(hall).connect() for _ in range(4)]
+        asyncio.run(play_all(hall, *players))
+        shown = [message["rule_in_force"] for message in players[0].of("turn")]
+    run = tmp_path / "out" / "round-1"
+    played = rows(run)
+    rule = played.rule.reshape(TURNS, 2, 3)
+    assert (rule[::2] == rule[1::2]).all(), "it decides every other turn"
+    sites = len(GOVERNED.map.sites)
+    before = np.concatenate([[[sites] * 2], played.stock.reshape(TURNS, 2, 3)[1:-1:2, :, 0]])
+    wanted = 1 - ((before / sites - 0.7) / 0.3).clip(0, 1)
+    assert rule[::2, :, 0].tolist() == np.abs(np.arange(3) / 2 - wanted[..., None]).argmin(-1).tolist()
+    assert len(np.unique(rule)) > 1
+    assert shown[1:] == [f"the tax rate: {option / 2:g}" for option in rule[:, 0, 0]]
+    assert played.fines == pytest.approx(played.harvest * played.rule / 2)
+    assert cprl.load(run).experiment.governor == StockRule(lower=0.7)
+    (again,) = map(record, fresh_episodes([run], replica=1))
+    assert again.entry("rule")[:, None].tolist() == rule[:, 1, :1].tolist()
+
+
+@pytest.mark.integration
+def test_the_governor_of_the_run_that_is_hosted_governs_people(tmp_path, monkeypatch):
+    learner = Learning(PPO(settings=RolloutSettings(rollout_steps=2, minibatch_size=2, hidden_cells=(4,))))
+    experiment = cprl.Experiment(
+        name="governed",
+        game=GOVERNED,
+        agents=(Scripted("greedy"),) * 2,
+        governor=learner,
+        episodes=2,
+        evaluation_episodes=2,
+    )
+    monkeypatch.chdir(tmp_path)
+    cprl.run(experiment, "trained", watch="off", figures=False)
+    rounds = (("governed", GOVERNED), ("none", ()))
+    plan = session(game="trained", rounds=rounds, turns=TURNS, seed=9)
+    with hosted(tmp_path / "out", plan, monkeypatch) as hall:
+        players = [Player(hall).connect() for _ in range(2)]
+        asyncio.run(play_all(hall, *players, until=lambda: hall.rounds[0].turn >= 3))
+        rule = rows_so_far(hall.rounds[0])
+    with hosted(tmp_path / "out", plan, monkeypatch) as hall:  # it decides the same again, by chance too
+        again = [Player(hall, player.secret).connect() for player in players]
+        asyncio.run(play_all(hall, *again))
+    played = rows(tmp_path / "out" / "round-1")
+    assert played.rule[: len(rule)].tolist() == rule
+    assert set(played.rule) <= {0, 1, 2}
+    assert cprl.load(tmp_path / "out" / "round-1").experiment.governor == Frozen("trained", 2)
+    assert set(rows(tmp_path / "out" / "round-2").rule) == {-1}
+
+
+def rows_so_far(played):
+    return [rule for batch in played._journals[0].batches for rule in batch["rule"].to_pylist()]
+
+
+def test_a_governor_that_no_round_has_or_that_does_not_fit_is_refused():
+    with pytest.raises(ValueError, match=r"session\.governor"):
+        session(governor=StockRule()).games()
+    with pytest.raises(ValueError, match="number"):
+        session(GOVERNED, governor=Constant(0.3)).games()
 
 
 def test_a_journal_that_ends_anywhere_keeps_its_whole_batches(tmp_path):

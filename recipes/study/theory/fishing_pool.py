@@ -2,8 +2,13 @@
 
 Source: Piatti, Jin, Kleiman-Weiner and others, "Cooperate or Collapse: Emergence of Sustainable Cooperation
 in a Society of LLM Agents" (NeurIPS 2024, arXiv 2404.16698), and its program on GitHub, giorgiopiatti/GovSim,
-for what happens when agents want more than there is. Five agents, twelve rounds, 100 units, which double
-after each round up to 100; below 5 units the pool has collapsed. Without the talk between rounds.
+for what happens when agents want more than there is, and for what each may take so that the pool does not
+shrink (`simulation/scenarios/common/environment/concurrent_env.py`). Five agents, twelve rounds, 100 units,
+which double after each round up to 100; below 5 units the pool has collapsed.
+
+Between rounds the agents of GovSim read what each has caught, and then speak one after the other, at most ten
+times. Here all agents observe the catches, and with `talk` each may say one thing with its wish, which the
+others read in the next round.
 """
 
 from dataclasses import dataclass
@@ -37,6 +42,8 @@ class FishingPool(Value):
     capacity: Positive = 100
     collapse: Positive = 5
     """The pool has collapsed if fewer units are left after a round."""
+    talk: bool = False
+    """Whether agents whose actions a language model chooses send each other messages."""
 
     @property
     def about(self) -> str:
@@ -60,13 +67,18 @@ def has_survived(episode: Any) -> float:
 
 def share_of_optimum(episode: Any) -> float:
     """Return what was taken of what the full pool yields for ever, half of 100 units in each of 12 rounds;
-    the paper calls it efficiency."""
+    the paper calls it efficiency, 1 - max(0, T f(0) - R) / (T f(0))."""
     return min(1.0, float(episode.harvest.sum()) / (12 * 50))
 
 
-MEASURES = (rounds_survived, has_survived, share_of_optimum)
-"""The measures of the paper for `Experiment(metrics=MEASURES)`; gain and equality every game has. Over-usage,
-the share of wishes above a sustainable share, is not among them."""
+def over_usage(episode: Any) -> float:
+    """Return the share of actions that took more than an equal share of what the pool regrows, see
+    `FishingEnv.sustainable`, of all agents and rounds until the end."""
+    return float(episode.violations.sum()) / float(len(episode.violations) * episode.steps)
+
+
+MEASURES = (rounds_survived, has_survived, share_of_optimum, over_usage)
+"""The measures of the paper for `Experiment(metrics=MEASURES)`; gain and equality every game has."""
 
 
 class FishingEnv(EnvBase):
@@ -85,6 +97,7 @@ class FishingEnv(EnvBase):
     ) -> None:
         super().__init__(device=device, batch_size=torch.Size([worlds]))
         self.game = game
+        self.talk = game.talk
         self._first_world = first_world
         each = (worlds, game.agents)
         for name in ("units", "round", "episode"):
@@ -93,7 +106,8 @@ class FishingEnv(EnvBase):
         self.register_buffer("seed_bits", torch.zeros((), dtype=torch.int64))
         self._set_seed(seed)
         observed = Bounded(0, max(game.capacity, game.rounds), (*each, 2 + game.agents), dtype=torch.uint8)
-        agents = Composite(observation=observed, harvest=Unbounded(each), shape=each)
+        violated = Binary(game.agents, each, dtype=torch.bool)
+        agents = Composite(observation=observed, harvest=Unbounded(each), violated=violated, shape=each)
         stock = Bounded(0, game.capacity, (worlds, 1), dtype=torch.int64)
         self.observation_spec = Composite(agents=agents, stock=stock, shape=(worlds,))
         self.action_spec = Composite(
@@ -109,6 +123,10 @@ class FishingEnv(EnvBase):
     def _set_seed(self, seed: int | None) -> None:
         self.seed_bits.fill_(drawn_seed() if seed is None else seed % 2**63)
         self.episode.zero_()
+
+    def sustainable(self) -> torch.Tensor:
+        """Return what each agent may take so that the pool does not shrink, int64 [B, 1]."""
+        return self.units // 2 // self.game.agents
 
     def _moment(self, terminated: torch.Tensor, truncated: torch.Tensor, **agents: Any) -> TensorDict:
         """Return what is observed now; what an agent took comes first in its own observation."""
@@ -132,20 +150,22 @@ class FishingEnv(EnvBase):
         self.taken = torch.where(begins, 0, self.taken)
         self.episode = self.episode + begins
         never = torch.zeros_like(begins)
-        return self._moment(never, never.clone())
+        return self._moment(never, never.clone(), violated=torch.zeros_like(self.taken, dtype=torch.bool))
 
     def _step(self, tensordict: Any) -> TensorDict:
         wanted = tensordict["agents", "action"]
         taken = wanted.clone()
         for world in torch.nonzero(wanted.sum(1) > self.units[:, 0]).flatten().tolist():
             taken[world] = torch.from_numpy(self._shared(world, wanted[world].numpy()))
+        violated = taken > self.sustainable()
         self.taken = taken
         left = self.units - taken.sum(1, keepdim=True)
         self.round = self.round + 1
         terminated = left < self.game.collapse
         truncated = ~terminated & (self.round >= self.game.rounds)
         self.units = torch.where(terminated, left, (2 * left).clamp(max=self.game.capacity))
-        return self._moment(terminated, truncated, reward=taken.float().unsqueeze(-1))
+        reward = taken.float().unsqueeze(-1)
+        return self._moment(terminated, truncated, reward=reward, violated=violated)
 
     def _shared(self, world: int, wanted: Any) -> Any:
         """Return what agents get who want more than there is: each unit goes to one who wants more."""

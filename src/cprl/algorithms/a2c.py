@@ -4,19 +4,17 @@ from dataclasses import dataclass
 
 from torchrl.objectives import A2CLoss, LossModule
 
-from cprl.algorithms.base import Coefficient, OnPolicy, actor_critic_loss
+from cprl.algorithms.base import ActorCritic, actor_critic_loss
 from cprl.networks.agent import AgentNetworks
 
 
 @dataclass(frozen=True, kw_only=True)
-class A2C(OnPolicy):
+class A2C(ActorCritic):
     """Advantage actor-critic, TorchRL's `A2CLoss`; meant for one epoch per rollout.
 
     Source: Mnih et al., "Asynchronous Methods for Deep Reinforcement Learning" (2016), here synchronous.
     """
 
-    entropy_coeff: Coefficient = 0.01
-    critic_coeff: Coefficient = 0.5
     can_be_recurrent = True
     update = "stacked"
 

@@ -26,7 +26,7 @@ from cprl.learners.protocol import AnyLearner
 from cprl.learners.refusals import check_loss, refuse_other_networks
 from cprl.learners.replay import Replay
 from cprl.learners.rollouts import Rollouts
-from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, RolloutSettings
+from cprl.learners.settings import DEFAULT_HIDDEN_CELLS, DQNSettings, RolloutSettings, along_line
 from cprl.learners.transitions import Horizon
 from cprl.networks.agent import AgentNetworks, acting_network
 from cprl.networks.mlp import MLP
@@ -36,7 +36,7 @@ from cprl.networks.team import TeamNetwork
 from cprl.objectives.rewards import Reward, reward_name
 from cprl.objectives.td import TORCHRL_DISTANCES
 from cprl.system.compat.torchrl import LaneCategorical
-from cprl.values import Custom, Range, Value, Where, checked, hints_of, refusal
+from cprl.values import Custom, Range, Steps, Value, Where, checked, hints_of, refusal
 
 Coefficient = Annotated[float, Range(0, 1e6)]
 """The weight of one term of a loss, 0 or more."""
@@ -346,6 +346,33 @@ class OnPolicy(Algorithm, stored=False):
         refuse_other_networks(network)
         make_rollouts = PlainRollouts if engine == "torchrl" else Rollouts
         return make_rollouts(lanes, self.settings, network, self.make_loss(deepcopy(network)))
+
+
+@dataclass(frozen=True, kw_only=True)
+class ActorCritic(OnPolicy, stored=False):
+    """The base of algorithms whose loss has a weight for the policy's entropy, and one for the critic."""
+
+    entropy_coeff: Coefficient = 0.01
+    """The weight of the policy's entropy in the loss."""
+    entropy_coeff_end: Coefficient | None = None
+    """The weight after the linear change; None for a constant one."""
+    entropy_decay_steps: Steps = 1_000_000
+    """Environment steps of the linear change, from the first step on, as
+    `RolloutSettings.learning_rate_decay_steps`."""
+    critic_coeff: Coefficient = 0.5
+    """The weight of the critic's loss."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.entropy_coeff == 0 and self.entropy_coeff_end:  # A2CLoss then computes no entropy at all
+            name = f"{type(self).__name__}.entropy_coeff_end"
+            raise refusal(name, self.entropy_coeff_end, "None with an entropy_coeff of 0")
+
+    def entropy_coeff_at(self, step: int) -> float:
+        """Return the weight of the entropy at a step, counted from 0."""
+        if self.entropy_coeff_end is None:
+            return self.entropy_coeff
+        return along_line(self.entropy_coeff, self.entropy_coeff_end, step / self.entropy_decay_steps)
 
 
 class TeamAlgorithm(Algorithm, stored=False):

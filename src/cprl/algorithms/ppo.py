@@ -6,7 +6,7 @@ from typing import Annotated, ClassVar
 
 from torchrl.objectives import ClipPPOLoss, LossModule
 
-from cprl.algorithms.base import Coefficient, OnPolicy, actor_critic_loss
+from cprl.algorithms.base import ActorCritic, actor_critic_loss
 from cprl.networks.agent import AgentNetworks
 from cprl.values import Custom, Range
 
@@ -14,13 +14,11 @@ ClipEpsilon = Annotated[float, Range(1e-6, 0.999)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Clipped(OnPolicy, stored=False):
+class Clipped(ActorCritic, stored=False):
     """The base of algorithms with a clipped ratio."""
 
     clip_epsilon: ClipEpsilon = 0.2
     """The largest change of an action's probability, as a ratio minus 1."""
-    entropy_coeff: Coefficient = 0.01
-    critic_coeff: Coefficient = 0.5
     can_be_recurrent = True
     loss_kind: ClassVar[Callable[..., LossModule]]
     """TorchRL's loss."""

@@ -27,15 +27,16 @@ The rules, each on one world, and the arrays that they work on:
     chance       counter-based random numbers
     world        the arrays of B worlds: state, output of a step, working memory
     moves        walking, clashes, and the return of tagged agents
-    quirks       Quirks2019: rules in which the program of 2019 differs from its paper
     beam         beams, hits and tags
-    river        River: rules about waste in a river and its cleaning
     actions      an agent's action: walk, turn, fire, clean, signal
     apples       harvest and regrowth
     views        the picture of the board and the observations of agents
     signals      signals that agents send with their actions
     turn         the order of events in a turn and in an episode
     loops        the loops over worlds that a thread runs
+
+Groups of rules that are off by default have a module each, see `RuleGroups` in rules: `river`, about waste in
+a river and its cleaning, and `quirks`, in which the program of 2019 differs from its paper.
 
 How the rules are run, which `cprl.system.jit` compiles:
 

@@ -32,3 +32,6 @@ class Spaces(Value, stored=False):
     floating-point ones."""
     actions: Positive
     """The number of actions A from which an agent chooses."""
+    talk: bool = False
+    """Whether agents whose plans language models make send each other messages, in a game that is no
+    `cprl.Game`: the attribute `talk` of its environment."""

@@ -126,6 +126,7 @@ def spaces_of(env: EnvBase) -> Spaces:
         observation_dtype=str(observation.dtype).removeprefix("torch."),
         observation_scale=scale,
         actions=int(action_spec.n),
+        talk=bool(getattr(env, "talk", False)),
     )
 
 

@@ -33,7 +33,7 @@ from cprl.system.output import say
 from cprl.system.working import working
 from cprl.training.stored import LoadedRun, as_loaded
 from cprl.values import Natural, Range, Seed, checked, refusal
-from cprl.values.array_types import Bool
+from cprl.values.array_types import AnyArray, Bool
 
 EPISODES_TRIED: Final = 5
 """The number of fresh episodes from which a typical one is chosen."""
@@ -206,18 +206,21 @@ def _replayed(run: LoadedRun, group: int) -> FreshEpisode:
     if not path.is_file():
         raise ValueError(f"{path} does not exist; without it people cannot be played again")
     rows = where(read_table(path), group=group).sort_by([("turn", "ascending"), ("agent", "ascending")])
-    names = ("action", "decision") if run.game.decisions else ("action",)
     stored = where(run.episodes(), replica=group)
     steps = stored["steps"][0].as_py()
     if len(rows) != steps * run.game.agents:
         raise ValueError(
             f"{path} has {len(rows)} rows of group {group}; allowed: {steps} turns of all agents"
         )
-    choices = [rows[name].to_numpy().reshape(steps, 1, -1) for name in names]
+    choices: dict[Any, AnyArray] = {keys.ACTION: rows["action"].to_numpy().reshape(steps, 1, -1)}
+    if run.game.decisions:
+        choices[keys.DECISION] = rows["decision"].to_numpy().reshape(steps, 1, -1)
+    if run.experiment.governor is not None:
+        choices[keys.RULE] = rows["rule"].to_numpy().reshape(steps, -1)[:, :1]
 
     def again() -> FreshEpisode:
         env = run.env(seed=run.experiment.seed, first_world=group)
-        return FreshEpisode(run, env, RecordedPolicy(*choices), group, 0)
+        return FreshEpisode(run, env, RecordedPolicy(choices), group, 0)
 
     (episode,) = evaluate(again().env, again().policies)
     if episode.harvest is None or episode.harvest.tolist() != stored["harvest"].to_pylist():

@@ -13,6 +13,7 @@ Modules in reading order:
 
     arrays       allocates named tuples of arrays, and takes single worlds out of them
     ledger       Ledger, which all institutions share: violations, fines and transfers
+    equality     how evenly agents share what they have
     institution  Institution, the base class of all values
     boundaries   Boundaries: regions with owners
     seasons      ClosedSeason: times without harvest
@@ -21,7 +22,7 @@ Modules in reading order:
     rotation     Rotation: agents harvest in turn
     taxes        Tax on the harvest, and Levies of nested groups
     votes        Vote on a tax or a quota, and how ballots are held
-    governor     Governor: sets the number of a tax or a quota every few turns
+    governor     Governor: sets the number of another institution every few turns
     monitoring   Monitoring: violations are detected by chance, at a cost
     sanctions    GraduatedSanctions: time-outs and fines that grow with the offences
     mediation    Mediation: unjust tags are refunded

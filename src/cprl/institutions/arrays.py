@@ -2,7 +2,7 @@
 
 The annotation of a field says the dtype, the axes and the role of its array. For example,
 `taken: Annotated[Int32, "B Q N", STEPS]` is an int32 array with three axes. An axis is a letter, whose length
-is given when the array is allocated, or a number, its length.
+is given when the array is allocated, a number, its length, or the name of a field `name: int` of the tuple.
 
 The axis B of worlds comes first; an array without it is a parameter of the game. The role is an `InState`,
 such as `IN_STATE` or `STEPS`, for an array that is part of a world's state, and `DERIVED` for an array that
@@ -47,7 +47,7 @@ class Field(NamedTuple):
     """The annotation of an array in a named tuple, taken apart."""
 
     axes: tuple[str, ...]
-    """The letter, or the length as text, of each axis."""
+    """The letter or name, or the length as text, of each axis."""
     dtype: type[np.generic]
     role: InState | str = ""
     """An `InState`, `DERIVED`, or "" without a role."""
@@ -99,6 +99,8 @@ def filled(kind: type[Tuple], values: Mapping[str, Any], **sizes: int) -> Tuple:
             entries[name] = values[name]
         elif not isinstance(field, Field):
             entries[name] = field(values[name])
+            if field is int:
+                sizes[name] = entries[name]
         elif name in values:
             entries[name] = np.ascontiguousarray(values[name], field.dtype)
             sizes |= dict(zip(field.axes, entries[name].shape, strict=True))

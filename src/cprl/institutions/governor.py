@@ -3,22 +3,29 @@
 No agent votes on the number. An experiment says by what the governor decides, see `Experiment.governor`.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, Literal
 
 import numpy as np
 
+from cprl.institutions.equality import equality
 from cprl.institutions.institution import Ballot, Institution
 from cprl.institutions.quotas import Quota
+from cprl.institutions.sanctions import GraduatedSanctions
 from cprl.institutions.taxes import Tax
 from cprl.institutions.votes import Choices
 from cprl.values import Custom, Positive, Share, Where
 from cprl.values.array_types import AnyArray, Float32
 
-Number = Literal["quota.share", "tax.rate"]
-SETS: Final[dict[str, type[Tax | Quota]]] = {"quota.share": Quota, "tax.rate": Tax}
+Number = Literal["quota.share", "tax.rate", "sanctions.level"]
+SETS: Final[dict[str, type[Institution]]] = {
+    "quota.share": Quota,
+    "tax.rate": Tax,
+    "sanctions.level": GraduatedSanctions,
+}
 """The kind of institution that has each number."""
-Sight = Literal["stock", "harvest", "lowest_harvest", "violations", "time"]
+Sight = Literal["stock", "harvest", "lowest_harvest", "equality", "violations", "time"]
 Objective = Literal["income", "lowest_income", "income_times_equality"]
 Sights = Annotated[
     tuple[Sight, ...],
@@ -28,7 +35,8 @@ Sights = Annotated[
 
 @dataclass(frozen=True, kw_only=True)
 class Governor(Institution):
-    """A governor sets the share of a quota or the rate of a tax, in each world by itself.
+    """A governor sets the share of a quota, the rate of a tax, or the level at which `GraduatedSanctions`
+    punish a first offence, in each world by itself.
 
     It decides before the first turn of a training or an evaluation, and then after every `every_steps` turns.
     Its number stays in force until it decides again, also where a new episode begins. Without a governor in
@@ -41,7 +49,8 @@ class Governor(Institution):
     used."""
 
     options: Choices = (0.0, 0.25, 0.5, 0.75, 1.0)
-    """The values to choose from, at least two, in ascending order; for a tax in 0..1."""
+    """The values to choose from, at least two, in ascending order: for a tax in 0..1, for sanctions whole
+    numbers up to the highest level."""
 
     every_steps: Positive = 50
     """The length of a period: the turns from one decision to the next."""
@@ -49,8 +58,9 @@ class Governor(Institution):
     sees: Sights = ("stock", "harvest", "lowest_harvest", "violations", "time")
     """What it sees of a world: "stock", the share of all sites that hold an apple; of the episode so far
     "harvest", the apples per turn of all agents, "lowest_harvest", the lowest harvest of an agent relative to
-    the mean, and "violations", the share of turns in which an agent broke a rule; "time", the part of the
-    longest episode that is over."""
+    the mean, "equality", 1 - Gini of the harvests (`cprl.institutions.equality`), and "violations", the share
+    of turns in which an agent broke a rule; "time", the part of the longest episode that is over. Where
+    nobody has harvested yet, all have the same: "lowest_harvest" and "equality" are 1."""
 
     objective: Objective | Custom = "income"
     """What it wants of a period, see `cprl.measuring.welfare`; or a function of its own, which returns a
@@ -82,11 +92,7 @@ class Governor(Institution):
                 f'Governor.sets is "{self.sets}"; allowed: a number of an institution of the game, on which '
                 "no agent votes"
             )
-        if isinstance(governed, Tax) and (governed.brackets or self.options[-1] > 1):
-            raise ValueError(
-                f"Governor.options goes up to {self.options[-1]:g} for {governed}; allowed: 0..1, for a Tax "
-                "without brackets"
-            )
+        governed.check_choices("Governor.options", self.options)
         if self.every_steps > game.rules.episode_steps:
             raise ValueError(
                 f"Governor.every_steps is {self.every_steps}; allowed: up to the {game.rules.episode_steps} "
@@ -107,11 +113,12 @@ class Governor(Institution):
         """
         played = np.maximum(steps, 1)
         mean = harvested.mean(1)
-        sights = {
-            "stock": stock,
-            "harvest": harvested.sum(1) / played,
-            "lowest_harvest": np.where(mean > 0, harvested.min(1) / np.maximum(mean, 1e-9), 1.0),
-            "violations": violations.mean(1) / played,
-            "time": steps / clock,
+        sights: dict[str, Callable[[], AnyArray]] = {
+            "stock": lambda: stock,
+            "harvest": lambda: harvested.sum(1) / played,
+            "lowest_harvest": lambda: np.where(mean > 0, harvested.min(1) / np.maximum(mean, 1e-9), 1.0),
+            "equality": lambda: np.nan_to_num(equality(harvested), nan=1.0),
+            "violations": lambda: violations.mean(1) / played,
+            "time": lambda: steps / clock,
         }
-        return np.stack([sights[name] for name in self.sees], 1).astype(np.float32)
+        return np.stack([sights[name]() for name in self.sees], 1).astype(np.float32)

@@ -168,7 +168,7 @@ def shown_value(law: Law, entry: int, i: int, turn: int) -> float:
     if module == VOTES:
         return show_in_force(law.votes, law.ledger, argument)
     if module == SANCTIONS:
-        return show_level(law.sanctions, i)
+        return show_level(law.sanctions, law.ledger, i)
     if module == MEDIATION:
         return show_mark(law.mediation, law.ledger, argument, i, turn)
     return show_may_fire(law.sanctioner, i)

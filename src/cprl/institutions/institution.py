@@ -54,6 +54,8 @@ class Institution(Value, stored=False):
     index of the name."""
     counts: ClassVar[tuple[str, ...]] = ()
     """The names in `cprl.institutions.COUNT_NAMES` that it counts, besides violations."""
+    voted_on: ClassVar[str] = ""
+    """The number of it that agents can vote on, or a governor sets, in words; "" for none."""
 
     @property
     def rule(self) -> "Institution":
@@ -83,6 +85,10 @@ class Institution(Value, stored=False):
             agents: the number of agents N.
         """
         return [(entry, number) for entry in self.entries]
+
+    def check_choices(self, name: str, choices: Sequence[float]) -> None:
+        """Raise a ValueError if a choice is no value of the number that is `voted_on`; `name` stands for the
+        field with the choices, in ascending order."""
 
     def may_harvest(self, agent: int, row: int, col: int) -> bool:
         """Return whether it lets an agent ever harvest on a cell."""

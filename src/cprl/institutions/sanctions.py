@@ -1,5 +1,6 @@
 """GraduatedSanctions: time-outs and fines that grow with an agent's offences."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -32,7 +33,8 @@ class GraduatedSanctions(Institution):
 
     This is Ostrom's principle 5, graduated sanctions. Being tagged by another agent is an offence, or a
     detected violation, or both, see `on`. An agent's first offence is punished at level 0, and every offence
-    raises the level for the next one. Agents observe their level, 0..1.
+    raises the level for the next one. Agents observe their level, 0..1. With a governor of
+    "sanctions.level" first offences are punished at the level that it sets.
     """
 
     freeze_steps: Freezes = (5, 25, 100, 100)
@@ -53,6 +55,7 @@ class GraduatedSanctions(Institution):
     entries: ClassVar[tuple[str, ...]] = ("sanction level",)
     at_most: ClassVar[int | None] = 1
     counts: ClassVar[tuple[str, ...]] = ("sanctions", "returns_to_violation")
+    voted_on: ClassVar[str] = "the level of a first offence"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -75,6 +78,14 @@ class GraduatedSanctions(Institution):
     @property
     def needs_tags(self) -> bool:
         return self.on == "tags"
+
+    def check_choices(self, name: str, choices: Sequence[float]) -> None:
+        highest = max(np.shape(self.freeze_steps)[-1], len(self.fines)) - 1
+        if choices[-1] > highest or any(choice % 1 for choice in choices):
+            raise ValueError(
+                f"{name} is {tuple(choices)}; allowed for these GraduatedSanctions: levels, whole numbers in "
+                f"0..{highest}"
+            )
 
     def check(self, game: Any) -> None:
         if self.is_table and len(self.freeze_steps) != game.agents:
@@ -101,15 +112,17 @@ class Arrays(NamedTuple):
     """The turns without an offence after which a level falls; 0 for never."""
     for_tags: bool
     for_violations: bool
+    ballot: int
+    """The index in force of the level of a first offence; -1 for none, and level 0."""
     level: Annotated[Int32, "B N", IN_STATE]
-    """The level of the next sanction."""
+    """The level of the next sanction, above that of a first offence."""
     offence_step: Annotated[Int32, "B N", STEPS]
     """The step of the agent's last offence, or of the last fall of its level if that was later."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
     """Return the parameters in `Arrays` by name."""
-    for sanctions, _ in with_ballots(game, GraduatedSanctions):
+    for sanctions, ballot in with_ballots(game, GraduatedSanctions):
         levels = np.atleast_2d(sanctions.freeze_steps)
         return {
             "steps": np.broadcast_to(levels, (game.agents, levels.shape[1])),
@@ -117,9 +130,11 @@ def parameters(game: Any) -> dict[str, Any]:
             "recovery": sanctions.recovery_steps or 0,
             "for_tags": sanctions.is_for_tags,
             "for_violations": sanctions.on != "tags",
+            "ballot": ballot,
         }
     steps = np.zeros((game.agents, 0))
-    return {"steps": steps, "fine": (), "recovery": 0, "for_tags": False, "for_violations": False}
+    nothing = {"fine": (), "recovery": 0, "for_tags": False, "for_violations": False, "ballot": -1}
+    return {"steps": steps, **nothing}
 
 
 def forget_offences(sanctions: Arrays) -> None:
@@ -129,14 +144,23 @@ def forget_offences(sanctions: Arrays) -> None:
         sanctions.offence_step[i] = 0
 
 
-def time_out(sanctions: Arrays, shooter: int, i: int) -> int:
+def next_level(sanctions: Arrays, ledger: Ledger, i: int) -> int:
+    """Return the level at which the next offence of agent i is punished."""
+    if sanctions.ballot < 0:
+        return sanctions.level[i]
+    return sanctions.level[i] + int(ledger.in_force[sanctions.ballot])
+
+
+def time_out(sanctions: Arrays, ledger: Ledger, shooter: int, i: int) -> int:
     """Return the turns that agent i misses for an offence at its level; `shooter`: who tagged it."""
-    return sanctions.steps[shooter, min(sanctions.level[i], sanctions.steps.shape[1] - 1)]
+    level = next_level(sanctions, ledger, i)
+    return sanctions.steps[shooter, min(level, sanctions.steps.shape[1] - 1)]
 
 
 def offend(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> None:
     """Let agent i pay the fine of its level for an offence, and raise its level by one."""
-    ledger.fines[i] += sanctions.fine[min(sanctions.level[i], sanctions.fine.shape[0] - 1)]
+    level = next_level(sanctions, ledger, i)
+    ledger.fines[i] += sanctions.fine[min(level, sanctions.fine.shape[0] - 1)]
     sanctions.level[i] += 1
     sanctions.offence_step[i] = turn
     ledger.counts[i, SANCTIONS] += 1
@@ -154,7 +178,7 @@ def sanction_tag(
     steps = 0
     for j in range(tagged_by.shape[0]):
         if tagged_by[i, j]:
-            steps = max(steps, time_out(sanctions, j, i))
+            steps = max(steps, time_out(sanctions, ledger, j, i))
     offend(sanctions, ledger, i, turn)
     return steps
 
@@ -163,7 +187,7 @@ def sanction_violation(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> 
     """Punish agent i for a detected violation, if that is an offence, and return the turns that it misses."""
     if not sanctions.for_violations:
         return 0
-    steps = time_out(sanctions, i, i)
+    steps = time_out(sanctions, ledger, i, i)
     offend(sanctions, ledger, i, turn)
     return steps
 
@@ -177,7 +201,7 @@ def forgive(sanctions: Arrays, turn: int) -> None:
                 sanctions.offence_step[i] = turn
 
 
-def show_level(sanctions: Arrays, i: int) -> float:
+def show_level(sanctions: Arrays, ledger: Ledger, i: int) -> float:
     """Return what agent i observes of its level: the level relative to the highest one, 0..1."""
     last = max(1, sanctions.fine.shape[0] - 1, sanctions.steps.shape[1] - 1)
-    return min(sanctions.level[i], last) / last
+    return min(next_level(sanctions, ledger, i), last) / last

@@ -1,5 +1,6 @@
 """Tax on the harvest, and Levies, by which nested groups share a part of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple
 
@@ -48,6 +49,12 @@ class Tax(Institution):
     between the apples of a bracket and those of the next one is taxed at this rate. Empty for one `rate`."""
 
     voted_on: ClassVar[str] = "the tax rate"
+
+    def check_choices(self, name: str, choices: Sequence[float]) -> None:
+        if self.brackets or choices[-1] > 1:
+            raise ValueError(
+                f"{name} has {choices[-1]:g} for {self}; allowed: 0..1, for a Tax without brackets"
+            )
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -53,8 +53,7 @@ class Vote(Institution):
         super().__post_init__()
         if isinstance(self.on, Tax) and self.on.brackets:
             raise ValueError("Vote.on is a Tax with brackets; allowed: a Tax with one rate")
-        if isinstance(self.on, Tax) and self.choices[-1] > 1:
-            raise ValueError(f"Vote.choices has {self.choices[-1]:g}; allowed for a Tax: 0..1")
+        self.on.check_choices("Vote.choices", self.choices)
 
     @property
     def rule(self) -> Institution:

@@ -170,12 +170,14 @@ class Learner:
         return actor
 
     def _follow_schedules(self) -> None:
-        """Set epsilon and the learning rate to their values at the current step."""
+        """Set epsilon, the learning rate and the entropy's weight to their values at the current step."""
         schedule = getattr(self.settings, "epsilon", None)
         epsilon = 0.0 if schedule is None else schedule(self.steps)  # stochastic policies have no epsilon
         self.actor.explore_with(epsilon)
         if self.lane_networks.rule.decays:
             self.lane_networks.learning_rate = self.settings.learning_rate_at(self.steps)
+        if getattr(self.algorithm, "entropy_coeff_end", None) is not None:
+            self.lane_networks.set_entropy_coeff(self.algorithm.entropy_coeff_at(self.steps))
 
     def _actor(
         self, outputs: Callable[..., Any], purpose: Purpose, worlds: int, *, compile: bool

@@ -122,6 +122,11 @@ class LaneNetworks:
         self._compiled = Compiled(LaneNetworks._step, what="updates run", changes=(4,), enabled=self.compiles)
         self._evaluate = Compiled(_outputs_of_both, what="rollouts are evaluated", enabled=self.compiles)
 
+    def set_entropy_coeff(self, value: float) -> None:
+        """Set the weight of the entropy in the losses of the next steps."""
+        for loss in self.losses:
+            loss.module.entropy_coeff.fill_(value)
+
     def learn(self, draw: Draw) -> Tensor:
         """Take one step of all networks from a batch; return their losses, float [L / S]."""
         self.updates += 1

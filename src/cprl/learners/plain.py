@@ -101,6 +101,11 @@ class PlainNetworks:
                 getattr(loss, f"target_{name}").data.copy_(weights.data)
         self.optimizers = [torch_optimizer(rule, loss.parameters()) for loss in self.losses]
 
+    def set_entropy_coeff(self, value: float) -> None:
+        """Set the weight of the entropy in the losses of the next steps."""
+        for loss in self.losses:
+            loss.entropy_coeff.fill_(value)
+
     def learn(self, batch: TensorDictBase) -> Tensor:
         """Take one step of each agent from a batch of its own, [L, b]; return the losses, [L]."""
         losses = torch.stack([self.learn_agent(agent, batch[agent]) for agent in range(len(batch))])

@@ -25,6 +25,11 @@ LongSteps = Annotated[int, Range(0, MOST_INT64)]
 ReturnSteps = Annotated[int, Range(1, 1000)]
 
 
+def along_line(start: float, end: float, share: float) -> float:
+    """Return the number at a share of the way from `start` to `end`, and `end` beyond it."""
+    return start + min(1.0, share) * (end - start)
+
+
 @dataclass(frozen=True, kw_only=True)
 class EpsilonGreedy(Value, stored=False):
     """Epsilon-greedy exploration: the probability of a random action is held, then decays linearly."""
@@ -61,8 +66,7 @@ class LearningRateDecay(Value, stored=False):
         """Return the optimiser's step size at a step, counted from 0."""
         if self.learning_rate_end is None:
             return self.learning_rate
-        decayed_share = min(1.0, step / self.learning_rate_decay_steps)
-        return self.learning_rate + decayed_share * (self.learning_rate_end - self.learning_rate)
+        return along_line(self.learning_rate, self.learning_rate_end, step / self.learning_rate_decay_steps)
 
 
 @dataclass(frozen=True, kw_only=True)

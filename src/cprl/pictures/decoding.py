@@ -4,8 +4,21 @@ from typing import Final
 
 import numpy as np
 
-from cprl.commons.cells import APPLE, BEAM, CLEANING, GROUND, MARK, OTHER, SELF, WALL, WASTE, WATER
+from cprl.commons.cells import (
+    APPLE,
+    BEAM,
+    CLEANING,
+    FIRST_AGENT,
+    GROUND,
+    MARK,
+    OTHER,
+    SELF,
+    WALL,
+    WASTE,
+    WATER,
+)
 from cprl.commons.game import Game
+from cprl.institutions.boundaries import AGENT_SIGNS
 from cprl.values.array_types import UInt8
 
 UNSEEN: Final = 255
@@ -22,8 +35,10 @@ SIGNS: Final = {
     CLEANING: "*",
     MARK: "+",
     UNSEEN: "?",
+    **{FIRST_AGENT + agent: sign for agent, sign in enumerate(AGENT_SIGNS)},
 }
-"""The sign of each class of cells in a window as text; other agents that can be told apart are `O` too."""
+"""The sign of each class of cells in a window as text. Other agents are `O`; those that can be told apart are
+0 to 9, a to z, and `O` beyond."""
 
 
 def classes_seen(game: Game, windows: UInt8) -> UInt8:

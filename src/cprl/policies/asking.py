@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from http.client import HTTPException
 from os.path import isabs
@@ -23,6 +24,7 @@ from urllib.request import Request, urlopen
 from cprl.values import Natural, Positive, Range, Value, Where, short_repr
 
 T = TypeVar("T")
+Price = Annotated[float, Range(0, 1e6)]
 Text = Annotated[str, Where(lambda text: "\0" not in text, "a text without NUL")]
 
 CALLS: Final = "calls.jsonl"
@@ -31,7 +33,7 @@ OVER_LIMIT: Final = "more than max_calls"
 """What is kept of a call that was not made."""
 _FIELDS: Final = (
     *("hash", "call", "request", "answer", "failure", "tries", "seconds"),
-    *("prompt_tokens", "answer_tokens"),
+    *("prompt_tokens", "answer_tokens", "dollars"),
 )
 """What is kept of a call."""
 _MOST_BYTES: Final = 2**20
@@ -67,6 +69,8 @@ class Model(Value, stored=False):
     """The most calls of a run, of all its agents; later ones are not made."""
     timeout_s: Annotated[float, Range(0.01, 3600)] = 60.0
     """The most seconds that a try takes."""
+    prices: tuple[Price, Price] | None = None
+    """What a million tokens of prompts, and of answers, cost, in US dollars; None if they are not counted."""
     retries: Annotated[int, Range(0, 20)] = 2
     """How often a call is tried again, after silence or where the server is busy or fails."""
     backoff_s: Annotated[float, Range(0, 600)] = 1.0
@@ -111,6 +115,10 @@ class Calls:
         self.kept: dict[str, dict[str, Any]] = {}
         """The calls by the hashes of their requests."""
         self._path: Path | None = None
+        self._stored: dict[Path, dict[str, Any]] = {}
+        """The calls of other runs, see `Model.stored`, each run read once."""
+        self._most = 0
+        """The most calls of the model that was asked last."""
         self._lock = Lock()
 
     def keep_in(self, path: Path) -> None:
@@ -133,37 +141,34 @@ class Calls:
         """
         hashes = [_hash(question.request(model)) for question in questions]
         by_hash = dict(zip(hashes, questions, strict=True))
-        new = [question for name, question in by_hash.items() if name not in self.kept]
+        new = [by_hash[name] for name in by_hash if name not in self.kept]
+        self._most = model.max_calls
         if new and model.stored is not None:
             self._take(model, new)
         elif new:
-            made = sum(call["tries"] > 0 for call in self.kept.values())
-            count = max(0, model.max_calls - made)
-
-            def make(index: int) -> None:
-                self._make(model, new[index], read, is_allowed=index < count)
-
+            left = model.max_calls - sum(call["tries"] > 0 for call in self.kept.values())
+            most_tries = [1 + model.retries if index < left else 0 for index in range(len(new))]
             with ThreadPoolExecutor(model.concurrency) as pool:
-                list(pool.map(make, range(len(new))))
+                list(pool.map(partial(self._make, model, read), new, most_tries))
         return [_understood(self.kept[name]["answer"], read)[0] for name in hashes]
 
-    def _make(
-        self, model: Model, question: Question, read: Callable[[Any], Any], *, is_allowed: bool
-    ) -> None:
+    def _make(self, model: Model, read: Callable[[Any], Any], question: Question, most_tries: int) -> None:
         """Make a call, and keep what came of it."""
         request = question.request(model)
         began = time.monotonic()
         tries = 0
         outcome = _Outcome(None, OVER_LIMIT)
-        while is_allowed and tries <= model.retries:
+        while tries < most_tries:
             if tries:
                 time.sleep(model.backoff_s * 2 ** (tries - 1))
             tries += 1
             outcome = _post(model, request)
             if not outcome.may_retry:
                 break
-        if outcome.is_refused and all(call["answer"] is None for call in self.kept.values()):
+        # a list, since other threads keep calls meanwhile
+        if outcome.is_refused and all(call["answer"] is None for call in list(self.kept.values())):
             raise ConnectionError(f"{model.base_url} with the model {model.model!r}: {outcome.failure}")
+        prompt_price, answer_price = model.prices or (0.0, 0.0)
         self._keep(
             {
                 "hash": _hash(request),
@@ -175,13 +180,17 @@ class Calls:
                 "seconds": round(time.monotonic() - began, 3),
                 "prompt_tokens": outcome.prompt_tokens,
                 "answer_tokens": outcome.answer_tokens,
+                "dollars": (prompt_price * outcome.prompt_tokens + answer_price * outcome.answer_tokens)
+                / 1e6,
             }
         )
 
     def _take(self, model: Model, questions: Sequence[Question]) -> None:
         """Take calls from another run; refuse those that it does not keep."""
         path = Path(str(model.stored)) / CALLS
-        stored = read_calls(path)
+        if path not in self._stored:
+            self._stored[path] = read_calls(path)
+        stored = self._stored[path]
         for question in questions:
             request = question.request(model)
             name = _hash(request)
@@ -194,11 +203,13 @@ class Calls:
     def _keep(self, call: dict[str, Any]) -> None:
         with self._lock:
             if self._path is not None:
-                _append(self._path, json.dumps(call).encode())
+                with open(self._path, "a", encoding="utf-8") as file:
+                    # The last line may have been cut by a kill, so none relies on the end of another.
+                    file.write("\n" * (file.tell() > 0) + json.dumps(call))
             self.kept[call["hash"]] = call
 
     def in_words(self) -> str:
-        """Return how many calls were made, their tokens and their failures; "" without any."""
+        """Return how many calls were made, their tokens, failures and costs; "" without any."""
         calls = self.kept.values()
         if not calls:
             return ""
@@ -206,7 +217,13 @@ class Calls:
         tokens = sum(call["prompt_tokens"] for call in calls)
         answered = sum(call["answer_tokens"] for call in calls)
         failed = sum(call["failure"] is not None for call in calls)
-        return f"{made:,} calls, {tokens:,} + {answered:,} tokens, {failed:,} without a usable answer"
+        words = f"{made:,} calls, {tokens:,} + {answered:,} tokens, {failed:,} without a usable answer"
+        dollars = sum(call["dollars"] for call in calls)
+        if dollars:
+            words += f", {dollars:,.4f} US dollars"
+        if dollars and self._most:
+            words += f" ({self._most:,} such calls: {dollars / made * self._most:,.2f})"
+        return words
 
 
 class _Outcome(NamedTuple):
@@ -234,15 +251,6 @@ def read_calls(path: Path) -> dict[str, dict[str, Any]]:
         except (TypeError, LookupError):
             raise ValueError(f"{path} holds {short_repr(call)}; allowed: calls as cprl keeps them") from None
     return calls
-
-
-def _append(path: Path, line: bytes) -> None:
-    """Append a line to a file, whose last one may have been cut."""
-    with open(path, "a+b") as file:
-        if file.tell():
-            file.seek(-1, os.SEEK_END)
-            line = line if file.read() == b"\n" else b"\n" + line
-        file.write(line + b"\n")
 
 
 def _hash(request: dict[str, Any]) -> str:
@@ -286,8 +294,6 @@ def _body(message: Request, timeout_s: float) -> bytes:
                 raise TimeoutError
             if len(body) > _MOST_BYTES:
                 raise ValueError("too long")
-        if response.length:
-            raise ValueError("half an answer")
     return body
 
 

@@ -19,9 +19,9 @@ from cprl.values import Share, Value
 class StockRule(Value):
     """A governor that goes by the stock: the more apples are left, the more it allows.
 
-    The number is the option nearest to f times the highest one for a quota, and to 1 - f times it for a tax;
-    f is 0 up to a stock of `lower`, 1 from a stock of `upper` on, and linear in between. By default the quota
-    is proportional to the stock.
+    The number is the option nearest to f times the highest one for a quota, and to 1 - f times it for a tax
+    or for sanctions; f is 0 up to a stock of `lower`, 1 from a stock of `upper` on, and linear in between. By
+    default the quota is proportional to the stock.
 
     Source: the harvest control rules of fisheries, in which the catch is a constant fraction of the stock or
     falls to 0 at a threshold: Deroba and Bence, "A review of harvest policies: understanding relative

@@ -3,12 +3,14 @@
 Every some steps the model is shown what the agent observes, as text, and answers a plan as JSON: a scripted
 policy and its numbers, which the agent follows until the next. In a game that is no `cprl.Game` it is shown
 the numbers that the agent observes, and answers an action. Where an answer is bad or missing, the agent falls
-back to a policy that was said beforehand.
+back to a policy that was said beforehand. In games with talk an answer may hold a message, which the models
+of the other agents of the world read in later turns.
 """
 
+import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import torch
@@ -30,13 +32,15 @@ from cprl.policies.scripted import (
     SPARE,
     ScriptedActor,
     ScriptedPolicy,
+    can_tag,
+    plan_numbers,
     scripted_lanes,
 )
 from cprl.values import Natural, Positive, Range, Value, build, checked
 from cprl.values.array_types import AnyArray, Float32, Int64
 
-_TURN, _LEFT, _HARVEST, _PLAN = range(4)
-"""The numbers that an agent carries from turn to turn: the turns of the episode so far, the turns left of its
+_TURN, _NEXT, _HARVEST, _PLAN = range(4)
+"""The numbers that an agent carries from turn to turn: the turns of the episode so far, the turn of its next
 plan, its harvest; and where those of the plan begin."""
 _LARGEST_SEED: Final = 2**31
 
@@ -54,19 +58,37 @@ class Language(Model):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan(Value, stored=False, called="plan"):
+class Plan(Value, stored=False):
     """What an agent does until the next plan."""
 
     policy: ScriptedPolicy
     spare: Annotated[int, Range(1, 8)] = SPARE
     """The apples that "sustainable" leaves near each that it takes."""
+    region: tuple[Natural, Natural] | None = None
+    """The rows ahead and the columns to each side in which it harvests, see `ScriptedActor`."""
+    tag: tuple[Natural, ...] | None = None
+    """The agents at whom it fires, see `ScriptedActor`."""
     signal: Natural = 0
     """The signal that it sends in each turn, see `Rules.signals`; 0 for none."""
-    why: str = ""
+
+
+def _form(entries: dict[str, Any], *, talks: bool) -> str:
+    """Return what a model has to know about the form of its answer.
+
+    Args:
+        entries: an example of each entry, and what it is.
+        talks: whether agents send each other messages.
+    """
+    entries = {"why": ("...", "a short reason"), **entries}
+    if talks:
+        entries["message"] = "...", "a text that all other agents read with their next question"
+    example = json.dumps({name: value for name, (value, _) in entries.items()})
+    meanings = " ".join(f'"{name}" is {meaning}.' for name, (_, meaning) in entries.items())
+    return f"Answer with one JSON object and nothing else, in this form:\n{example}\n{meanings}"
 
 
 class _BoardPlans:
-    """Plans on a board: a scripted policy, the apples that it spares, and a signal.
+    """Plans on a board: the numbers of a scripted policy, see `plan_numbers`, and last a signal.
 
     Args:
         game: the game that is played.
@@ -75,27 +97,37 @@ class _BoardPlans:
 
     def __init__(self, game: Game, script: ScriptedActor) -> None:
         self.game = game
-        self.fallback: tuple[int, ...] = (SCRIPTED_POLICIES.index(script.policy), SPARE, 0)
+        self.talks = game.rules.signals > 0
+        """Whether agents send each other messages."""
+        self.fallback = (*plan_numbers(game, script.policy), 0)
         """The numbers of the plan of an agent without an answer."""
-        self.in_keys: tuple[str, ...] = (keys.HARVEST[1], keys.IN_PLAY[1], *script.in_keys[1:])
+        self._widest = self.fallback[2:4]
+        """The region of an agent that harvests wherever it sees."""
+        self.in_keys = (keys.HARVEST[1], keys.IN_PLAY[1], *script.in_keys[1:])
         """The entries of "agents" that it reads beside observations."""
         self._script = script
 
     def rules(self, spec: Language) -> str:
         """Return what a model has to know before it answers."""
-        rules = self.game.rules
-        policies = [f'- "{policy}": {behaviour}' for policy, behaviour in BEHAVIOURS.items()]
-        signal = f'"signal" is 0 to {rules.signals}, which others see.' * bool(rules.signals)
+        rows, columns = self._widest
+        where = f"the rows ahead, 0 to {rows}, and columns to each side, 0 to {columns}, where you harvest"
+        entries: dict[str, Any] = {
+            "policy": ("...", "a name of the list"),
+            "spare": (SPARE, "1 to 8"),
+            "region": (self._widest, where),
+        }
+        if can_tag(self.game):
+            entries["tag"] = [1], "at whom you fire; leave it out to fire as the policy says"
+        if self.talks:
+            entries["signal"] = 0, f"0 to {self.game.rules.signals}, which others see"
         return "\n".join(
             [
                 f"You are one of {self.game.agents} agents on a board.",
                 *instructions_of(self.game, "window"),
                 "Each apple that you pick is a point for you.",
-                f"Every {spec.every_steps} turns you choose a plan, which is played for you. Answer with one",
-                "JSON object and nothing else, in this form:",
-                '{"why": "...", "policy": "...", "spare": 3' + ', "signal": 0' * bool(rules.signals) + "}",
-                f'"why" is a short reason, "policy" a name of the list, "spare" 1 to 8. {signal}'.rstrip(),
-                *policies,
+                f"Every {spec.every_steps} turns you choose a plan, which is played for you.",
+                _form(entries, talks=self.talks),
+                *(f'- "{policy}": {behaviour}' for policy, behaviour in BEHAVIOURS.items()),
             ]
         )
 
@@ -112,8 +144,11 @@ class _BoardPlans:
         )
 
     def _in_words(self, plan: Sequence[int]) -> str:
-        policy, spare, signal = plan
-        return f"{SCRIPTED_POLICIES[policy]}, spare {spare}" + f", signal {signal}" * bool(signal)
+        policy, spare, rows, columns, *foes, signal = plan
+        region = f", region {rows}, {columns}" * ((rows, columns) != self._widest)
+        tag = f", tag {np.flatnonzero(foes).tolist()}" * (can_tag(self.game) and any(foes))
+        said = f", signal {signal}" * bool(signal)
+        return f"{SCRIPTED_POLICIES[policy]}, spare {spare}{region}{tag}{said}"
 
     def _planes(self, observation: AnyArray) -> list[str]:
         """Return in words what the channels beside those of the board show, where the game has them."""
@@ -142,41 +177,37 @@ class _BoardPlans:
 
     def read(self, table: Any) -> tuple[int, ...]:
         """Return the numbers of a plan; raise a ValueError if it is not allowed."""
-        plan = build(Plan, table, "plan")
-        checked("plan.signal", plan.signal, Annotated[int, Range(0, self.game.rules.signals)])
-        return SCRIPTED_POLICIES.index(plan.policy), plan.spare, plan.signal
+        plan = build(Plan, table, "answer")
+        checked("answer.signal", plan.signal, Annotated[int, Range(0, self.game.rules.signals)])
+        return *plan_numbers(self.game, plan.policy, plan.spare, plan.region, plan.tag), plan.signal
 
     def act(self, plans: Int64, tensordict: TensorDictBase) -> Int64:
-        """Return actions, int64 [B, S], by plans, [B, S, 3]."""
-        policies, spare, signal = np.moveaxis(plans, -1, 0)
+        """Return actions, int64 [B, S], by plans, [B, S, 5 + N]."""
         seen = map(tensordict.get, self._script.in_keys)
-        silent = self._script.choose_each(policies, spare, *seen)
-        return silent + signal * self.game.tables.silent_actions
+        silent = self._script.choose(*seen, plans=plans[..., :-1]).numpy(force=True)
+        return silent + plans[..., -1] * self.game.tables.silent_actions
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Action(Value, stored=False, called="answer"):
+class _Action(Value, stored=False):
     action: Natural
-    why: str = ""
 
 
 class _PlainActions:
     """Actions in a game that is no `cprl.Game`, which shows its agents numbers; a plan is an action."""
 
-    in_keys: tuple[str, ...] = ()
-    fallback: tuple[int, ...] = (-1,)
+    in_keys = ()
+    fallback = (-1,)
 
     def __init__(self, spaces: Spaces, script: LaneActor) -> None:
+        self.talks = spaces.talk
         self._actions = spaces.actions
         self._script = script
 
     def rules(self, spec: Language) -> str:
-        last = self._actions - 1
         every = "each turn" if spec.every_steps == 1 else f"every {spec.every_steps} turns"
-        return (
-            f"You choose an action {every}. Answer with one JSON object and nothing else:\n"
-            f'{{"why": "...", "action": 0}}\n"why" is a short reason, "action" an integer from 0 to {last}.'
-        )
+        form = _form({"action": (0, f"an integer from 0 to {self._actions - 1}")}, talks=self.talks)
+        return f"You choose an action {every}.\n{form}"
 
     def seen(self, observation: AnyArray, memory: Float32) -> str:
         turn = int(memory[_TURN])
@@ -206,6 +237,8 @@ class LanguageActor(TensorDictModuleBase):
         seeds: the seed of each lane, lane = replica x S + agent.
         agents: the number of agents S of each replica.
         worlds: the number of worlds k of each replica, consecutive in the batch.
+        said: what agents of all actors that play the same worlds said in this episode, turns and messages, by
+            the world in the batch and the agent.
     """
 
     out_keys = ("action", recurrent_state.AFTER)
@@ -219,24 +252,26 @@ class LanguageActor(TensorDictModuleBase):
         seeds: Sequence[Sequence[int]],
         agents: int,
         worlds: int = 1,
+        said: dict[tuple[int, int], list[tuple[int, str]]] | None = None,
     ) -> None:
         super().__init__()
         self.spec = spec
-        self.playing = playing
         self.agents = agents
         self.worlds = worlds
         self.replicas = len(seeds) // agents
         size: dict[str, Any] = {"seeds": seeds, "agents": agents, "worlds": worlds}
-        self._answers: _BoardPlans | _PlainActions
         if isinstance(playing, Game):
             self.script: Any = ScriptedActor(spec.fallback, playing, **size)
-            self._answers = _BoardPlans(playing, self.script)
+            self._answers: Any = _BoardPlans(playing, self.script)
         else:
             self.script = scripted_lanes(spec.fallback, playing, **size)
             self._answers = _PlainActions(playing, self.script)
         self._system = "\n".join(filter(None, (spec.instructions, self._answers.rules(spec))))
         self._calls = calls
         self._seeds = [tuple(seed) for seed in seeds]
+        self._numbers = [seed[2] for seed in self._seeds[:agents]]
+        """The indices of the S agents in the game."""
+        self._said = {} if said is None else said
         self._asked = np.zeros((len(seeds), worlds), np.int64)
         """How often each lane has asked in each world."""
         self.state_cells = _PLAN + len(self._answers.fallback)
@@ -245,46 +280,69 @@ class LanguageActor(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         observation = tensordict.get("observation")
         memory = tensordict.get(recurrent_state.AFTER).numpy(force=True).copy()
-        begins = memory[..., _TURN] == 0
-        memory[begins, _PLAN:] = self._answers.fallback
-        due = (memory[..., _LEFT] == 0) & ~tensordict.get(keys.DONE).numpy(force=True)
-        if keys.HARVEST[1] in self.in_keys:
-            harvest = tensordict.get(keys.HARVEST[1]).numpy(force=True)
-            memory[..., _HARVEST] += np.where(begins, 0, harvest)
+        for world, index in np.argwhere(memory[..., _TURN] == 0).tolist():
+            self._said[world, self._numbers[index]] = []
+        due = (memory[..., _NEXT] <= memory[..., _TURN]) & ~tensordict.get(keys.DONE).numpy(force=True)
+        if isinstance(self._answers, _BoardPlans):
+            memory[..., _HARVEST] += tensordict.get(keys.HARVEST[1]).numpy(force=True)
             due &= tensordict.get(keys.IN_PLAY[1]).numpy(force=True)
         if due.any():
             self._ask(observation.numpy(force=True), memory, np.argwhere(due))
-            memory[due, _LEFT] = self.spec.every_steps
+            memory[due, _NEXT] = memory[due, _TURN] + self.spec.every_steps
         actions = self._answers.act(memory[..., _PLAN:].astype(np.int64), tensordict)
         memory[..., _TURN] += 1
-        memory[..., _LEFT] = np.maximum(0, memory[..., _LEFT] - 1)
         tensordict.set("action", torch.from_numpy(actions).to(observation.device))
         return tensordict.set(recurrent_state.AFTER, torch.from_numpy(memory).to(observation.device))
 
     def _ask(self, observation: AnyArray, memory: Float32, due: Int64) -> None:
         """Ask for the plans of some agents, [n, 2] by world and agent, and write them into the memory."""
-        questions = []
-        for world, agent in due.tolist():
-            seen = self._answers.seen(observation[world, agent], memory[world, agent])
-            questions.append(self._question(world, agent, seen))
-        plans = self._calls.ask(self.spec, questions, self._answers.read)
-        for (world, agent), plan in zip(due.tolist(), plans, strict=True):
-            memory[world, agent, _PLAN:] = plan or self._answers.fallback
+        questions = [
+            self._question(world, index, observation[world, index], memory[world, index])
+            for world, index in due.tolist()
+        ]
+        answers = self._calls.ask(self.spec, questions, self._read)
+        for (world, index), answer in zip(due.tolist(), answers, strict=True):
+            plan, message = answer or (self._answers.fallback, "")
+            memory[world, index, _PLAN:] = plan
+            if message:
+                self._said[world, self._numbers[index]].append((int(memory[world, index, _TURN]), message))
 
-    def _question(self, index: int, agent: int, seen: str) -> Question:
-        """Return what an agent of a world of the batch asks, and count it."""
-        replica, world = divmod(index, self.worlds)
-        lane = replica * self.agents + agent
+    def _read(self, table: dict[str, Any]) -> tuple[tuple[int, ...], str]:
+        """Return the numbers of a plan, and a message; raise a ValueError if they are not allowed."""
+        plan = dict(table)
+        checked("why", plan.pop("why", ""), str)
+        message = checked("message", plan.pop("message", ""), Text if self._answers.talks else Literal[""])
+        return self._answers.read(plan), message
+
+    def _heard(self, world: int, listener: int, turn: float) -> list[str]:
+        """Return the last message of each other agent before a turn, a line each; [] in a game without
+        talk."""
+        lines = [f"You are agent {listener}."] * self._answers.talks
+        for (where, agent), messages in sorted(self._said.items()):
+            earlier = [message for said_in, message in messages if said_in < turn]
+            if where == world and agent != listener and earlier:
+                lines.append(f"Agent {agent} says: {json.dumps(earlier[-1], ensure_ascii=False)}")
+        return lines
+
+    def _question(self, row: int, index: int, observation: AnyArray, memory: Float32) -> Question:
+        """Return what an agent asks, by its row and index in the batch, and count it."""
+        replica, world = divmod(row, self.worlds)
+        lane = replica * self.agents + index
         number = int(self._asked[lane, world])
         self._asked[lane, world] += 1
-        run_seed, replica_number, agent_number, *purpose = self._seeds[lane]
-        what = Purpose(tuple(purpose)).name.lower()
-        call = f"{what}, seed {run_seed}, replica {replica_number}, world {world}, agent {agent_number}, "
+        run_seed, replica_number, agent, *purpose = self._seeds[lane]
+        call = (
+            f"{Purpose(tuple(purpose)).name.lower()}, seed {run_seed}, replica {replica_number}, "
+            f"world {world}, agent {agent}, call {number}"
+        )
         seed = seed_of((*self._seeds[lane], world, number)) % _LARGEST_SEED
-        return Question(f"{call}call {number}", seed, self._system, seen)
+        heard = self._heard(row, agent, memory[_TURN])
+        prompt = "\n".join([*heard, self._answers.seen(observation, memory)])
+        return Question(call, seed, self._system, prompt)
 
     def get_extra_state(self) -> dict[str, Any]:
-        return {"asked": torch.tensor(self._asked)}
+        return {"asked": torch.tensor(self._asked), "said": self._said}
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         self._asked[:] = state["asked"].numpy(force=True)
+        self._said.update(state["said"])

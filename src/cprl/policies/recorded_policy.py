@@ -1,5 +1,8 @@
 """RecordedPolicy: a policy that takes the actions of an episode that was played."""
 
+from collections.abc import Mapping
+from typing import Any
+
 import torch
 from tensordict import TensorDictBase
 from torch import nn
@@ -14,15 +17,13 @@ class RecordedPolicy(JointPolicy):
     last turn.
 
     Args:
-        actions: the actions of T turns, integers [T, 1, N].
-        decisions: the decisions, like the actions, in a game with ballots.
+        choices: what was chosen in T turns, by the entry of `cprl.keys`: ACTION, integers [T, 1, N]; in a
+            game with ballots also DECISION, like the actions; where a governor decided RULE, [T, 1].
     """
 
-    def __init__(self, actions: AnyArray, decisions: AnyArray | None = None) -> None:
-        super().__init__([nn.Identity()] * actions.shape[-1])
-        self._choices = {keys.ACTION: actions}
-        if decisions is not None:
-            self._choices[keys.DECISION] = decisions
+    def __init__(self, choices: Mapping[Any, AnyArray]) -> None:
+        super().__init__([nn.Identity()] * choices[keys.ACTION].shape[-1])
+        self._choices = choices
         self._turn = -1
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:

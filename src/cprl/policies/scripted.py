@@ -13,8 +13,8 @@ this cell holds an apple.
   right with equal probability.
 - Before it enters a cell next to another agent, an agent waits with probability 0.5: if two agents want the
   same cell, neither gets it (docs/game.md), and two that never waited would starve there.
-- "greedy", "sustainable" and "pacifist" never fire. Without a beam, "territorial" equals "greedy", and
-  "aggressive" follows other agents.
+- "greedy", "sustainable" and "pacifist" fire at nobody but agents to `tag`. Without a beam, "territorial"
+  equals "greedy", and "aggressive" follows other agents.
 - "aggressive" first turns towards an agent that is farther to its side than ahead of it.
 - With `Quirks2019.self_paint_stays`, as in the study as run, an agent sees some other agents, even some out
   of play, in its own colour: it treats every cell of that colour except its own as another agent.
@@ -24,7 +24,8 @@ the harvest and how long it lasts ("greedy", "sustainable"), and peace ("territo
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Literal, get_args
+from functools import cache
+from typing import Annotated, Any, Final, Literal, get_args
 
 import numpy as np
 import torch
@@ -44,6 +45,7 @@ from cprl.policies.actors import ActorOfLanes, LaneActor
 from cprl.policies.scripted_rules import (
     AGENT,
     APPLE,
+    FOE,
     NUMBERS,
     OPEN,
     UNKNOWN,
@@ -53,7 +55,8 @@ from cprl.policies.scripted_rules import (
     Settings,
 )
 from cprl.system.jit.compiled import compiled_for_cpu
-from cprl.values.array_types import Float64, Int64, UInt8
+from cprl.values import Range, checked
+from cprl.values.array_types import Int64, UInt8
 
 ScriptedPolicy = Literal["random", "greedy", "sustainable", "territorial", "aggressive", "pacifist"]
 SCRIPTED_POLICIES: Final[tuple[ScriptedPolicy, ...]] = get_args(ScriptedPolicy)
@@ -89,6 +92,50 @@ SPARE: Final = 3
 probabilities, a site with 3 apples near it regrows five times as fast as one with 2. A cross of five sites,
 all near each other, grows fastest with 3 apples: 2 empty sites x 0.05 per turn, against 1 x 0.05 with 4
 apples and 3 x 0.01 with 2."""
+_FIRE: Final = ("territorial", "aggressive")
+
+
+def plan_numbers(
+    game: Game,
+    policy: ScriptedPolicy,
+    spare: int = SPARE,
+    region: Sequence[int] | None = None,
+    tag: Sequence[int] | None = None,
+) -> tuple[int, ...]:
+    """Return how an agent follows a policy, as 4 + N numbers: the index of the policy, `spare`, the rows and
+    columns of `region`, and for each agent of the game 1 if it is fired at.
+
+    Args:
+        game: the game that is played.
+        spare: see `ScriptedActor`, as are `region` and `tag`.
+
+    Raises:
+        ValueError: if the region is larger than the window; if `tag` names an agent that is not in the game,
+            or any in a game whose windows show all other agents alike, or without a beam.
+    """
+    rules = game.rules
+    rows = rules.window_rows - 1
+    columns = rules.window_columns // 2
+    if region is not None:
+        limits = tuple[Annotated[int, Range(0, rows)], Annotated[int, Range(0, columns)]]
+        rows, columns = checked("region", tuple(region), limits)
+    foes: Sequence[int] = range(game.agents) if policy in _FIRE else ()
+    if tag is not None:
+        foes = checked("tag", tuple(tag), tuple[Annotated[int, Range(0, game.agents - 1)], ...])
+        if foes and not can_tag(game):
+            raise ValueError(f"tag is {foes}; allowed without a beam and Observation.agents_apart: ()")
+    return (
+        SCRIPTED_POLICIES.index(policy),
+        spare,
+        rows,
+        columns,
+        *(agent in foes for agent in range(game.agents)),
+    )
+
+
+def can_tag(game: Game) -> bool:
+    """Return whether agents can tell at whom they fire."""
+    return game.rules.may_fire and game.observation.agents_apart
 
 
 class ScriptedActor(ActorOfLanes):
@@ -104,6 +151,9 @@ class ScriptedActor(ActorOfLanes):
         agents: the number of agents S of each replica.
         worlds: the number of worlds k of each replica, consecutive in the batch.
         spare: for "sustainable": the number of other apples near an apple that it harvests, at least 1.
+        region: the rows ahead, and the columns to each side, of its window, in which it harvests; None for
+            all. Elsewhere it goes around apples.
+        tag: the agents at whom it fires, in place of those at whom the policy fires; None for these.
 
     `epsilon`, initially 0, is the probability of a random action under `ExplorationType.RANDOM`; under other
     exploration types it has no effect.
@@ -118,6 +168,8 @@ class ScriptedActor(ActorOfLanes):
         agents: int,
         worlds: int = 1,
         spare: int = SPARE,
+        region: Sequence[int] | None = None,
+        tag: Sequence[int] | None = None,
     ) -> None:
         super().__init__(seeds, agents, worlds, NUMBERS)
         if game.observation.area != "window":
@@ -135,8 +187,8 @@ class ScriptedActor(ActorOfLanes):
         self.epsilon = 0.0
         if paints_over(game.rules.quirks):
             self.in_keys = ("observation", keys.APPLE_AHEAD[1])
-        self._settings = _settings(game, spare)
-        self._role_of_class = _roles()
+        self._plan = plan_numbers(game, policy, spare, region, tag)
+        self._settings = _settings(game)
         self._rim, self._frame = _frame(game)
         size = self._frame.stride * (game.rules.window_rows + 2 * self._rim)
         self._scratch = SearchBuffers(*np.zeros((2, size), np.bool_), *np.zeros((3, size), np.int32))
@@ -144,66 +196,68 @@ class ScriptedActor(ActorOfLanes):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         return tensordict.set("action", self.choose(*map(tensordict.get, self.in_keys)))
 
-    def choose(self, observation: Tensor, apple_ahead: Tensor | None = None) -> Tensor:
+    def choose(
+        self, observation: Tensor, apple_ahead: Tensor | None = None, *, plans: Int64 | None = None
+    ) -> Tensor:
         """Choose actions, int64 [replicas x k, S].
 
         Args:
             observation: uint8 [replicas x k, S, C, X, Y].
             apple_ahead: `cprl.keys.APPLE_AHEAD`, bool [replicas x k, S, 1], under `Quirks2019.paint_over`.
+            plans: the numbers of `plan_numbers` by which each agent chooses instead, int64
+                [replicas x k, S, 4 + N].
         """
         explores = exploration_type() in (ExplorationType.RANDOM, None)
         epsilon = float(self.epsilon) if explores else 0.0
-        roles = self._framed(observation, apple_ahead)
-        policy = SCRIPTED_POLICIES.index(self.policy)
-        chosen = self._choose(policy, epsilon, roles, self._numbers(), self._settings)
+        framed = self._framed(observation, apple_ahead)
+        numbers = self._numbers()
+        chosen = np.empty(len(framed), np.int64)
+        for lanes, (policy, spare, rows, columns, *foes) in self._by_plan(plans):
+            settings = self._settings._replace(
+                fires=self.game.rules.may_fire and any(foes),
+                spare=spare,
+                region_rows=rows,
+                region_columns=columns,
+            )
+            actions = chosen[lanes]
+            compiled_for_cpu(scripted_rules.choose_all, inline=False)(
+                policy,
+                epsilon,
+                _roles(tuple(foes))[framed[lanes]],
+                self._frame,
+                numbers[lanes],
+                settings,
+                self._scratch,
+                actions,
+            )
+            chosen[lanes] = actions
         return torch.from_numpy(chosen.reshape(observation.shape[:2])).to(observation.device)
 
-    def choose_each(
-        self, policies: Int64, spare: Int64, observation: Tensor, apple_ahead: Tensor | None = None
-    ) -> Int64:
-        """Choose actions by a policy of each agent instead of `policy`, int64 [replicas x k, S].
-
-        Args:
-            policies: indices into `SCRIPTED_POLICIES`, [replicas x k, S].
-            spare: see the constructor, [replicas x k, S].
-        """
-        roles = self._framed(observation, apple_ahead)
-        numbers = self._numbers()
-        kinds, kind = np.unique(np.stack([policies.ravel(), spare.ravel()], 1), axis=0, return_inverse=True)
-        chosen = np.empty(policies.size, np.int64)
-        for index, (policy, left) in enumerate(kinds.tolist()):
-            lanes = np.flatnonzero(kind.ravel() == index)
-            settings = self._settings._replace(spare=left)
-            chosen[lanes] = self._choose(policy, 0.0, roles[lanes], numbers[lanes], settings)
-        return chosen.reshape(policies.shape)
-
-    def _choose(
-        self, policy: int, epsilon: float, roles: UInt8, numbers: Float64, settings: Settings
-    ) -> Int64:
-        """Choose the actions of n agents, int64 [n], see `scripted_rules.choose_all`."""
-        chosen = np.empty(len(roles), np.int64)
-        compiled_for_cpu(scripted_rules.choose_all, inline=False)(
-            policy, epsilon, roles, self._frame, numbers, settings, self._scratch, chosen
-        )
-        return chosen
+    def _by_plan(self, plans: Int64 | None) -> list[tuple[Any, Sequence[int]]]:
+        """Return each plan with the agents that follow it, as indices into [replicas x k x S]."""
+        if plans is None:
+            return [(slice(None), self._plan)]
+        kinds, kind = np.unique(plans.reshape(-1, plans.shape[-1]), axis=0, return_inverse=True)
+        return [(np.flatnonzero(kind.ravel() == index), plan) for index, plan in enumerate(kinds.tolist())]
 
     def _framed(self, observation: Tensor, apple_ahead: Tensor | None) -> UInt8:
-        """Return the roles of the cells in each agent's window, with a frame of wall around them: uint8
+        """Return the classes of the cells in each agent's window, with a frame of wall around them: uint8
         [replicas x k x S, cells]."""
         ahead = observation.numpy(force=True)[..., : self.game.rules.window_rows, :]
         seen = classes_seen(self.game, ahead)
         rim = self._rim
         rows, columns = seen.shape[2:]
         count = seen.shape[0] * seen.shape[1]
-        roles = np.full((count, rows + 2 * rim, columns + 2 * rim), WALL, np.uint8)
-        roles[:, rim:-rim, rim:-rim] = self._role_of_class[seen].reshape(count, rows, columns)
+        framed = np.full((count, rows + 2 * rim, columns + 2 * rim), cells.WALL, np.uint8)
+        framed[:, rim:-rim, rim:-rim] = seen.reshape(count, rows, columns)
         row = rim + rows - 1
         middle = rim + columns // 2
-        roles[:, row, middle] = OPEN
+        framed[:, row, middle] = cells.GROUND
         if apple_ahead is not None:
-            cell_ahead = roles[:, row - 1, middle]  # a wall of the frame if the window has a single row
-            cell_ahead[apple_ahead.numpy(force=True).reshape(-1) & (cell_ahead == OPEN)] = APPLE
-        return roles.reshape(count, -1)
+            cell_ahead = framed[:, row - 1, middle]  # a wall of the frame if the window has a single row
+            is_open = _roles(())[cell_ahead] == OPEN
+            cell_ahead[apple_ahead.numpy(force=True).reshape(-1) & is_open] = cells.APPLE
+        return framed.reshape(count, -1)
 
     def _numbers(self) -> Any:
         """Draw the random numbers of this turn in the order of the batch: float64 [replicas x k x S,
@@ -233,19 +287,21 @@ def scripted_lanes(
     return ScriptedActor(policy, playing, seeds=seeds, agents=agents, worlds=worlds)
 
 
-def _settings(game: Game, spare: int) -> Settings:
-    """Return the properties of a game by which scripted agents choose."""
+def _settings(game: Game) -> Settings:
+    """Return the properties of a game by which scripted agents choose; those of plans are 0."""
     rules = game.rules
     return Settings(
         actions=game.tables.silent_actions,
         stay=game.actions.index("stay"),
-        has_beam=rules.may_fire,
+        fires=False,
         beam_length=min(rules.beam_lengths_cells),
         beam_half_width=min(rules.beam_width_cells, rules.window_columns) // 2,
         beam_tapers=rules.beam_tapers,
         beam_from_beside=rules.beam_from_beside,
         beam_stops_at_agents=rules.beam_stops_at_agents,
-        spare=spare,
+        spare=0,
+        region_rows=0,
+        region_columns=0,
     )
 
 
@@ -268,9 +324,11 @@ def _frame(game: Game) -> tuple[int, Frame]:
     )
 
 
-def _roles() -> UInt8:
-    """Return the role of each class of cell, uint8 [256]."""
-    roles = np.full(256, AGENT, np.uint8)
+@cache
+def _roles(foes: tuple[int, ...]) -> UInt8:
+    """Return the role of each class of cell, uint8 [256]; `foes`: 1 for each agent that is fired at."""
+    roles = np.full(256, FOE if all(foes) else AGENT, np.uint8)
+    roles[cells.FIRST_AGENT : cells.FIRST_AGENT + len(foes)] = np.where(foes, FOE, AGENT)
     open_ground = (cells.GROUND, cells.MARK, cells.BEAM)
     roles[[*open_ground, cells.WATER, cells.WASTE, cells.CLEANING]] = OPEN
     roles[cells.APPLE] = APPLE

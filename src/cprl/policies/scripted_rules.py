@@ -13,8 +13,9 @@ import numpy as np
 
 from cprl.values.array_types import Bool, Float64, Int32, Int64, UInt8
 
-OPEN, APPLE, AGENT, UNKNOWN, WALL = range(5)
-"""The roles of cells; paths can reach those up to AGENT. The agent's own cell is OPEN."""
+OPEN, APPLE, AGENT, FOE, UNKNOWN, WALL = range(6)
+"""The roles of cells; paths can reach those up to FOE, another agent at whom this one fires. The agent's own
+cell is OPEN."""
 
 
 class Frame(NamedTuple):
@@ -60,10 +61,15 @@ def spread(roles: UInt8, frame: Frame, blocked: Bool, steps: Int32, queue: Int32
             continue
         for offset in frame.neighbours:
             beside = np.uint64(cell + offset)
-            if steps[beside] < 0 and roles[beside] <= AGENT:
+            if steps[beside] < 0 and roles[beside] <= FOE:
                 steps[beside] = steps[cell] + 1
                 queue[known] = beside
                 known += 1
+
+
+def is_agent(role: int) -> bool:
+    """Return whether a role is that of another agent."""
+    return role in (AGENT, FOE)
 
 
 def count_own_steps(roles: UInt8, frame: Frame, scratch: SearchBuffers) -> None:
@@ -79,7 +85,7 @@ def count_others_steps(roles: UInt8, frame: Frame, scratch: SearchBuffers) -> No
     known = 0
     scratch.others_steps[:] = -1
     for cell in frame.cells:
-        if roles[cell] == AGENT:
+        if is_agent(roles[cell]):
             scratch.others_steps[cell] = 0
             scratch.queue[known] = cell
             known += 1
@@ -113,7 +119,7 @@ def is_beside_an_agent(roles: UInt8, frame: Frame, cell: int) -> bool:
     """Return whether a visible other agent is adjacent to a cell."""
     agents = 0
     for offset in frame.neighbours:
-        agents += roles[cell + offset] == AGENT
+        agents += is_agent(roles[cell + offset])
     return agents > 0
 
 
@@ -147,8 +153,8 @@ class Settings(NamedTuple):
     """The number of actions without a signal: these agents are silent."""
     stay: int
     """The index of the action "stay"."""
-    has_beam: bool
-    """True if there is a beam action."""
+    fires: bool
+    """Whether the agent has a beam, and fires at anyone."""
     beam_length: int
     """The cells ahead that a beam covers for every heading, since an agent does not know its heading."""
     beam_half_width: int
@@ -158,13 +164,26 @@ class Settings(NamedTuple):
     beam_stops_at_agents: bool
     spare: int
     """The number of other apples near an apple that "sustainable" harvests."""
+    region_rows: int
+    """The rows ahead in which the agent harvests."""
+    region_columns: int
+    """The columns to each side in which the agent harvests."""
 
 
-def target_apples(roles: UInt8, frame: Frame, scratch: SearchBuffers) -> None:
-    """Make all apples targets and block the cells of other agents."""
+def is_in_region(frame: Frame, settings: Settings, cell: int) -> bool:
+    """Return whether the agent harvests at a cell."""
+    ahead = frame.middle // frame.stride - cell // frame.stride
+    side = abs(cell % frame.stride - frame.middle % frame.stride)
+    return ahead <= settings.region_rows and side <= settings.region_columns
+
+
+def target_apples(roles: UInt8, frame: Frame, settings: Settings, scratch: SearchBuffers) -> None:
+    """Make the apples of the agent's region targets; block all other apples, and other agents."""
     for cell in frame.cells:
         scratch.targets[cell] = roles[cell] == APPLE
-        scratch.blocked[cell] = roles[cell] == AGENT
+        scratch.blocked[cell] = is_agent(roles[cell])
+        if scratch.targets[cell] and not is_in_region(frame, settings, cell):
+            exclude_apple(scratch, cell)
 
 
 def exclude_apple(scratch: SearchBuffers, cell: int) -> None:
@@ -213,7 +232,7 @@ def wander(roles: UInt8, frame: Frame, number: float, scratch: SearchBuffers) ->
 
 
 def has_target(roles: UInt8, frame: Frame, settings: Settings, guards: bool) -> bool:
-    """Return whether a beam would cover a visible agent; with `guards`, one that is near a visible apple."""
+    """Return whether a beam would cover a visible foe; with `guards`, one that is near a visible apple."""
     for side in range(-settings.beam_half_width, settings.beam_half_width + 1):
         begin = 0 if settings.beam_from_beside and side != 0 else 1
         end = settings.beam_length - abs(side) if settings.beam_tapers else settings.beam_length
@@ -221,8 +240,8 @@ def has_target(roles: UInt8, frame: Frame, settings: Settings, guards: bool) -> 
             cell = frame.middle + side - ahead * frame.stride
             if roles[cell] == WALL:
                 break
-            if roles[cell] == AGENT:
-                if not guards or apples_near(roles, frame, cell) > 0:
+            if is_agent(roles[cell]):
+                if roles[cell] == FOE and (not guards or apples_near(roles, frame, cell) > 0):
                     return True
                 if settings.beam_stops_at_agents:
                     break
@@ -230,9 +249,9 @@ def has_target(roles: UInt8, frame: Frame, settings: Settings, guards: bool) -> 
 
 
 def pursue(roles: UInt8, frame: Frame, number: float, settings: Settings, scratch: SearchBuffers) -> int:
-    """Turn towards the nearest reachable agent or walk towards it; -1 if there is none."""
+    """Turn towards the nearest reachable foe or walk towards it; -1 if there is none."""
     for cell in frame.cells:
-        scratch.targets[cell] = roles[cell] == AGENT
+        scratch.targets[cell] = roles[cell] == FOE
     goal = nearest(frame, scratch)
     if goal < 0:
         return -1
@@ -254,10 +273,9 @@ def choose(
     """
     if policy == RANDOM:
         return int(numbers[WHICH] * settings.actions)
-    fires = policy in (TERRITORIAL, AGGRESSIVE) and settings.has_beam
-    if fires and has_target(roles, frame, settings, policy == TERRITORIAL):
+    if settings.fires and has_target(roles, frame, settings, policy == TERRITORIAL):
         return BEAM
-    target_apples(roles, frame, scratch)
+    target_apples(roles, frame, settings, scratch)
     if policy == SUSTAINABLE:
         exclude_sparse_apples(roles, frame, settings, scratch)
     elif policy == PACIFIST:
@@ -267,7 +285,7 @@ def choose(
         action = pursue(roles, frame, numbers[WAITS], settings, scratch)
         if action >= 0:
             return action
-        target_apples(roles, frame, scratch)
+        target_apples(roles, frame, settings, scratch)
     goal = nearest(frame, scratch)
     if goal < 0:
         return wander(roles, frame, numbers[WANDERS], scratch)

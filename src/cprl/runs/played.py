@@ -16,8 +16,8 @@ from cprl.runs.weights import save_weights
 
 TURNS: Final = "turns.parquet"
 """The file with a row for each turn, group and agent of a hosted run. Its columns "turn", from 1, "group",
-"agent", "action" and, in games with ballots, "decision" are enough to replay it; "person", in runs that have
-it, says whether a person was there to act."""
+"agent", "action" and, in games with ballots, "decision", where a governor decided "rule", are enough to
+replay it; "person", in runs that have it, says whether a person was there to act."""
 
 
 def write_played(run: Path, episodes: Sequence[Episode], **tables: pa.Table) -> None:

@@ -24,7 +24,7 @@ from cprl.objectives.rewards import reward_name
 from cprl.policies.actors import random_agents
 from cprl.policies.asking import Calls
 from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
-from cprl.policies.governors import governor_spaces
+from cprl.policies.governors import Script, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_names, lane_seeds
@@ -50,7 +50,6 @@ from cprl.training.stored import (
     PoolActor,
     StoredAgent,
     decision_values,
-    language_agent,
     load,
     stored_actors,
     trained_agent,
@@ -115,7 +114,9 @@ class Population:
         self._game = None if commons is None else commons.game
         self.device = env.device or torch.device("cpu")
         groups = grouped(specs, self.spaces.agents)
-        self._specs_by_agent = specs_by_agent(specs, self.spaces.agents)
+        self._specs_by_agent: list[AgentSpec | GovernorSpec] = [*specs_by_agent(specs, self.spaces.agents)]
+        if governor is not None:
+            self._specs_by_agent.append(governor)
         check_scripted(groups, self.spaces, self._game)
         self._replica_numbers = range(first_replica, first_replica + self.replicas)
         self.calls = Calls()
@@ -127,13 +128,13 @@ class Population:
                 self.learners[agents] = self._make_learner(spec, agents, engine, starts)
         self._pools: dict[int, PoolActor] = {}
         self._stored_agents = self._load_stored_agents(weights or {})
+        self.governor = self._make_governor(governor, governor_from_turn)
+        """The governor, which counts as the agent after the last one, and how it learns; None without one."""
         self.others: dict[ActorAgents, nn.Module] = self.other_actors(Purpose.EXPLORATION, worlds=worlds)
         self.others |= {(agent,): pool for agent, pool in self._pools.items()}
         self.decisions: BanditDecider | None = self._make_decider()
         """The decisions of the agents on the game's ballots, and how they learn them; None without
         ballots."""
-        self.governor = self._make_governor(governor, governor_from_turn, weights or {})
-        """The governor, and how it learns; None without one."""
 
     @property
     def playing(self) -> Game | Spaces:
@@ -176,33 +177,33 @@ class Population:
         """Return copies of the learners' current acting networks, by "replica_0/agent_0" and so on, and the
         networks of past selves, see `PoolActor.networks`."""
         networks: dict[str, nn.Module] = {}
-        for learner in self.learners.values():
+        governors = {} if self.governor is None else self.governor.learners
+        for learner in [*self.learners.values(), *governors.values()]:
             networks |= learner.networks()
         for pool in self._pools.values():
             networks |= pool.networks()
-        return networks if self.governor is None else networks | self.governor.networks()
+        return networks
 
-    def _make_governor(
-        self, spec: GovernorSpec | None, from_turn: int, weights: Mapping[str, str]
-    ) -> Governing | None:
-        """Return the governor, which counts as the agent after the last one; None without one."""
+    def _make_governor(self, spec: GovernorSpec | None, from_turn: int) -> Governing | None:
         if spec is None:
             return None
         assert self._game is not None
-        assert self._game.governor is not None
+        agent = self.spaces.agents
         lanes = Lanes(
             governor_spaces(self._game),
-            agents=(self._game.agents,),
+            agents=(agent,),
             replicas=self.replicas,
             worlds=self.worlds,
             seed=self.seed,
             first_replica=self._replica_numbers.start,
             device=self.device,
         )
-        return Governing(self._game, self._game.governor, spec, lanes, from_turn=from_turn, weights=weights)
+        stored = self._stored_agents.get(agent, ())
+        return Governing(self._game, spec, lanes, stored=stored, from_turn=from_turn)
 
     def as_stored(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
-        """Return copies of the current agents of some replicas, by agent and replica."""
+        """Return copies of the current agents of some replicas, by agent and replica; the governor, if there
+        is one, comes last."""
         networks = self.networks()
         decisions = {} if self.decisions is None else self.decisions.learned()
         others = self._others_as_stored()
@@ -216,14 +217,17 @@ class Population:
         return agents
 
     def _load_stored_agents(self, weights: Mapping[str, str]) -> dict[int, list[StoredAgent]]:
-        """Make the pools; return the scripted and frozen agents of each replica by index. Each stored run is
-        read once."""
+        """Make the pools; return the scripted and frozen agents of each replica by index, the governor last.
+        Each stored run is read once."""
         runs: dict[str, LoadedRun] = {}
 
-        def frozen(spec: Frozen) -> list[StoredAgent]:
+        def frozen(spec: Frozen, *, governs: bool = False) -> list[StoredAgent]:
             if spec.run not in runs:
                 runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
-                _refuse_other_game(runs[spec.run], self.spaces, self._game, is_to_decide=True)
+                if not governs:
+                    _refuse_other_game(runs[spec.run], self.spaces, self._game, is_to_decide=True)
+            if governs:
+                _refuse_other_governor(runs[spec.run], spec, self._game)
             replicas = map(spec.replica_for, self._replica_numbers)
             stored = [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
             return [replace(one, calls=self.calls) for one in stored]
@@ -233,10 +237,13 @@ class Population:
         for agent, spec in enumerate(self._specs_by_agent):
             if isinstance(spec, Scripted):
                 agents[agent] = [StoredAgent(scripted=spec.policy)] * self.replicas
+            elif isinstance(spec, Script):
+                agents[agent] = [StoredAgent(scripted=spec)] * self.replicas
             elif isinstance(spec, Language):
-                agents[agent] = [language_agent(spec, self.calls)] * self.replicas
+                stored = StoredAgent(scripted=spec.fallback, language=spec, calls=self.calls)
+                agents[agent] = [stored] * self.replicas
             elif isinstance(spec, Frozen):
-                agents[agent] = frozen(spec)
+                agents[agent] = frozen(spec, governs=agent == self.spaces.agents)
             elif isinstance(spec, Pool):
                 self._pools[agent] = PoolActor(
                     list(map(frozen, spec.runs)),
@@ -273,15 +280,22 @@ class Population:
             replicas: the number of replicas; by default all.
         """
         numbers = self._replica_numbers[:replicas]
-        agents = {agent: stored[: len(numbers)] for agent, stored in self._others_as_stored().items()}
-        if purpose is Purpose.EXHIBITION:  # viewers cost no calls
-            agents = {agent: list(map(_without_language, stored)) for agent, stored in agents.items()}
+        others = self._others_as_stored()
+        others.pop(self.spaces.agents, None)  # the governor is no agent
+        agents = {agent: stored[: len(numbers)] for agent, stored in others.items()}
         kinds = {
             agent: (getattr(self._specs_by_agent[agent], "run", None), stored[0].kind)
             for agent, stored in agents.items()
         }
         seeds = partial(lane_seeds, self.seed, replicas=numbers, purpose=purpose)
-        return stored_actors(agents, self.playing, kinds=kinds, seeds=seeds, worlds=worlds)
+        return stored_actors(
+            agents,
+            self.playing,
+            kinds=kinds,
+            seeds=seeds,
+            worlds=worlds,
+            asks=purpose is not Purpose.EXHIBITION,  # viewers cost no calls
+        )
 
     def _make_decider(self) -> BanditDecider | None:
         sizes = () if self._game is None else ballot_sizes(self._game)
@@ -290,7 +304,7 @@ class Population:
             return None
         bandits = [
             (spec.decisions or Bandit()) if isinstance(spec, Learning | Team) else None
-            for spec in self._specs_by_agent
+            for spec in self._specs_by_agent[: self.spaces.agents]
         ]
         return BanditDecider(
             sizes,
@@ -345,10 +359,6 @@ class Population:
                 stored = run.agent(stored_agent, replica=stored_replica)
                 weights[lane_name(replica, agent)] = _loadable_weights(stored, algorithm, self.spaces, where)
         return weights
-
-
-def _without_language(agent: StoredAgent) -> StoredAgent:
-    return replace(agent, language=None)
 
 
 def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game: Game | None) -> None:
@@ -407,6 +417,14 @@ def _refuse_other_game(
     _refuse_unequal(f"the agents of {run.path}", "have", pairs)
 
 
+def _refuse_other_governor(run: LoadedRun, spec: Frozen, game: Any) -> None:
+    """Refuse a stored governor that sees or chooses from something else than that of the game."""
+    pair = _sees_and_options(run.game), _sees_and_options(game)
+    _refuse_unequal(f"the game of {run.path}", "has", {"a governor that sees and chooses from": pair})
+    if spec.agent != run.game.agents:
+        raise ValueError(f"governor is {spec}; allowed: the agent after the last one, {run.game.agents}")
+
+
 def _pairs(
     game_there: Any, spaces_there: Spaces, game: Game | None, spaces: Spaces
 ) -> dict[str, tuple[Any, Any]]:
@@ -432,6 +450,11 @@ def _refuse_unequal(subject: str, verb: str, pairs: Mapping[str, tuple[Any, Any]
     for name, (there, here) in pairs.items():
         if there != here:
             raise ValueError(f"{subject} {verb} {name} {there}; this game has {here}")
+
+
+def _sees_and_options(game: Any) -> Any:
+    governor = getattr(game, "governor", None)
+    return None if governor is None else (governor.sees, governor.options)
 
 
 def _ballot_choices(game: Game) -> list[tuple[str, tuple[float, ...]]]:

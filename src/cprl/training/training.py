@@ -182,7 +182,8 @@ class Training:
         self._shaped_returns = ShapedReturns(env.batch_size.numel(), spaces.agents, self.learners)
         for learner in self.learners.values():
             learner.begin()
-        self.finite = FiniteCheck(self.learners, spaces, worlds=schedule.worlds, on_nan=schedule.on_nan)
+        all_learners = self.learners if governor is None else {**self.learners, **governor.learners}
+        self.finite = FiniteCheck(all_learners, spaces, worlds=schedule.worlds, on_nan=schedule.on_nan)
         self.observer = Observer(callbacks, env, worlds=schedule.worlds)
         """The caller of the callbacks."""
         self._ended_episodes = [0] * self.replicas

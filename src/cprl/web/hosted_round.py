@@ -59,6 +59,7 @@ _COLUMNS: Final = {
     "tagged": pa.bool_(),
     "stock": pa.int32(),
     "decision": pa.int32(),
+    "rule": pa.int16(),
     keys.VIOLATED[-1]: pa.bool_(),
     keys.FINES[-1]: pa.float32(),
 }
@@ -67,7 +68,7 @@ TURN_COLUMNS: Final = pa.schema(_COLUMNS)
 
 "ms" counts since 1970; "person": a person acts, also by doing nothing, and no script for who has left;
 "given": the person chose the action; "cell", "heading" and "in_play" are those after the turn; "decision" is
--1 without ballots."""
+-1 without ballots; "rule" is the option that a governor has put in force, -1 where none decides."""
 CHAT_COLUMNS: Final = pa.schema(
     {**{name: _COLUMNS[name] for name in ("turn", "ms", "group", "agent")}, "text": pa.string()}
 )
@@ -140,6 +141,7 @@ class HostedRound:
         self.folder = folder
         self.seed = session.seed + number
         self._runs = runs
+        self._governor = session.governor_of(game, runs)
         self._journals: list[Journal] = []
         self.episodes: dict[int, Episode] = {}
         """The episode of each group that has ended."""
@@ -166,7 +168,8 @@ class HostedRound:
     def _set_up(self) -> None:
         """Put worlds, agents and totals at their beginning."""
         self._env = CommonsEnv(self.game, self.session.groups, seed=self.seed)
-        self._policy = Population(self._env, self._specs, seed=self.seed).policy(1)
+        population = Population(self._env, self._specs, seed=self.seed, governor=self._governor)
+        self._policy = population.policy(1)
         self._tracker = tracker_of(self._env)
         self._moment = self._env.reset()
         self._income = np.zeros((self.session.groups, self.game.agents))
@@ -209,8 +212,9 @@ class HostedRound:
                 episodes=1,
                 replicas=self.session.groups,
                 seed=self.seed,
+                governor=self._governor,
             )
-            start(self.folder, experiment, partners_in(self._specs), session=session_id)
+            start(self.folder, experiment, partners_in(experiment.specs), session=session_id)
         self._journals = [
             Journal(self.folder / "turns.arrows", TURN_COLUMNS),
             Journal(self.folder / "chat.arrows", CHAT_COLUMNS),
@@ -283,6 +287,7 @@ class HostedRound:
             "tagged": agents["tagged_by"].numpy().any(-1),
             "stock": now.stock_left,
             "decision": self._batch[keys.DECISION].numpy() if self.game.decisions else NONE,
+            "rule": NONE if self._governor is None else self._batch[keys.RULE].numpy()[:, None],
             keys.VIOLATED[-1]: self._violated,
         }
         for _, name in (keys.IN_PLAY, keys.HARVEST, keys.FIRED, keys.FINES):

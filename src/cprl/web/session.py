@@ -1,6 +1,7 @@
 """HostedSession: everything that is decided about a hosted game before the first person joins, as a value."""
 
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal, TypeAlias
 
@@ -9,8 +10,9 @@ from cprl.commons.game import Game
 from cprl.evaluation.fresh import typical_replica
 from cprl.evaluation.play import board_named
 from cprl.institutions import Institution
+from cprl.policies.governors import Script
 from cprl.policies.scripted import ScriptedPolicy
-from cprl.population import AgentSpec, Frozen, Scripted
+from cprl.population import AgentSpec, Frozen, GovernorSpec, Scripted
 from cprl.training.stored import LoadedRun, load
 from cprl.values import checked, refusal
 from cprl.web.hosting import STAY, TRAINED, Hosting, ShortText
@@ -27,6 +29,9 @@ class HostedSession(Hosting, stored=False, called="session"):
     """The game; or the name of a published board, the directory of a run, or a file with a drawing."""
     rounds: tuple[tuple[ShortText, Treatment], ...] = ()
     """The treatment of each round with its name; () for one round of the game as it is."""
+    governor: Frozen | Script | None = None
+    """By what the governor of a game decides, see `cprl.Experiment.governor`; None for that of the run whose
+    agents may play, if it fits, or else the first option."""
     consent: str | None = field(default=None, repr=False)
     """The text that people consent to before they play; None for none."""
 
@@ -45,15 +50,19 @@ class HostedSession(Hosting, stored=False, called="session"):
         game = self.game
         if isinstance(game, str):
             game, _ = board_named(game, "published")
-        return [
-            (name, self._game_of(name, game, rules)) for name, rules in self.rounds or (("the game", game),)
-        ]
+        rounds = self.rounds or (("the game", game),)
+        games = [(name, self._game_of(name, game, rules)) for name, rules in rounds]
+        if self.governor is not None and all(game.governor is None for _, game in games):
+            raise refusal("session.governor", self.governor, "None where no round has a Governor")
+        return games
 
     def _game_of(self, name: str, base: Game, rules: Treatment) -> Game:
         """Return the game of a round."""
         try:
             game = rules if isinstance(rules, Game) else replace(base, institutions=rules)
             game = replace(game, map=maps.with_agents(game.map, self.people + len(self.agents)))
+            if game.governor is not None and isinstance(self.governor, Script):
+                self.governor.check(game.governor)
             return with_turns(game, self.turns or game.rules.episode_steps)
         except ValueError as error:
             raise ValueError(f"round {name!r}: {error}") from error
@@ -91,6 +100,22 @@ class HostedSession(Hosting, stored=False, called="session"):
             else:
                 specs.append(Scripted(word))  # type: ignore[arg-type]
         return specs
+
+    def governor_of(self, game: Game, runs: Sequence[LoadedRun]) -> GovernorSpec | None:
+        """Return by what the governor of a round's game decides; None without one, and where its first option
+        stays in force.
+
+        Args:
+            runs: the runs whose governors may decide.
+        """
+        if game.governor is None:
+            return None
+        if self.governor is not None:
+            return self.governor
+        for run in runs:
+            if run.experiment.governor is not None and run.game.governor == game.governor:
+                return Frozen(os.path.relpath(run.path), run.game.agents, replica=typical_replica(run))
+        return None
 
     def names(self) -> list[str]:
         """Return what the agents of a group are called, e.g. "person 2" and "agent 5 (trained)"."""
