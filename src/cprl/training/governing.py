@@ -103,8 +103,7 @@ class Governing:
         assert self.actor.seen is not None
         assert self.actor.rule is not None
         period = self._period
-        stock = period[keys.STOCK][:, 0] / len(self._game.map.sites)
-        reward = welfare(self._governor, period["income"], period["steps"], stock)
+        reward = welfare(self._game, period["income"], period["steps"], period[keys.STOCK][:, 0])
         entries = {
             keys.OBSERVATION: self._as_last(self.actor.seen),
             keys.ACTION: self._as_last(self.actor.rule),
