@@ -29,6 +29,7 @@ PRINTS = {
     "own_network": "agent_0: ConvNetwork, [0-9,]+ weights\n.*agent_1: Tanh, [0-9,]+ weights",
     "own_loss": rf"__main__:huber: {NUMBER}, {NUMBER} apples\n__main__:Hysteretic: {NUMBER}, {NUMBER} apples",
     "own_institution": rf"fee 0.5: \d+ shots, which cost {NUMBER} apples",
+    "licence": r"fines by episode and agent: \[\d\.\d, ",
     "stop_bites": r"a reserve of 3: [23] to [23] apples are left",
     "own_game": rf"trained, agent_0/return: {INTERVAL}\nrandom, agent_0/return: {INTERVAL}",
     "evaluate": rf"collective_return, trained - random: {INTERVAL}\ntensor\(\[\[",

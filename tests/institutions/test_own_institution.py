@@ -1,8 +1,7 @@
-"""Institutions of a user's own, in docs/institutions.md and in examples: what they take, and how they are
-resumed."""
+"""Institutions of a user's own, in the examples: what they take, and how they are resumed."""
 
 import importlib
-import re
+import shutil
 import sys
 from dataclasses import replace
 
@@ -22,19 +21,14 @@ from cprl.runs.checkpoints import checkpoints_in
 from cprl.runs.episodes import read_episodes
 from cprl.runs.weights import load_weights
 
-PAGE = ROOT / "docs" / "institutions.md"
 ALLOW = ("licence:Licence", "own_parts:Stopping")
 BOARD = maps.parse("A>..<.A\n.......\nA.....A")
 
 
 @pytest.fixture(params=["licence"])
 def licence(request, tmp_path, monkeypatch):
-    """A module of the page or an example, where a user would have it."""
-    if request.param == "licence":
-        (code,) = re.findall(r"```python\n(# licence\.py\n.*?)```", PAGE.read_text(), re.DOTALL)
-    else:
-        code = (ROOT / "examples" / f"{request.param}.py").read_text()
-    (tmp_path / f"{request.param}.py").write_text(code)
+    """An example as a module where a user would have it."""
+    shutil.copy(ROOT / "examples" / f"{request.param}.py", tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     importlib.invalidate_caches()
     yield importlib.import_module(request.param)

@@ -113,6 +113,15 @@ def test_a_server_that_is_not_there_or_refuses_all_is_named_before_anything_is_k
     assert not (tmp_path / CALLS).exists()
 
 
+def test_a_server_that_goes_away_is_no_crash_for_calls_at_the_same_time():
+    calls = Calls()
+    with served(by_seed) as server:
+        model = Model(base_url=server.url, **QUICK, concurrency=16)
+        assert calls.ask(model, [question(0)], number_in) == [0]
+    answers = calls.ask(model, [question(number) for number in range(200)], number_in)
+    assert answers == [0] + [None] * 199
+
+
 def test_the_key_is_sent_and_never_kept(tmp_path, monkeypatch):
     monkeypatch.setenv("A_KEY", "sesame")
     with served(by_seed) as server:

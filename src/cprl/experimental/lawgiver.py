@@ -1,6 +1,5 @@
 """Lawgivers: between episodes a language model reads what came of them, and answers institutions."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,8 +35,9 @@ class Lawgiver(Model, stored=False):
         def read(answer: Any) -> Game:
             return replace(game, institutions=from_config(answer.get("institutions"), "institutions"))
 
-        metrics = [f"- {name}: {value:.4g}" for name, value in metrics_of(table).items()]
-        prompt = "\n".join([f"Institutions now: {rules_of(game) or NO_RULES}.", "What came of it:", *metrics])
+        prompt = "\n".join(
+            [f"Institutions now: {rules_of(game) or NO_RULES}.", "What came of it:", *_metrics(table)]
+        )
         question = Question(f"law {number}", seed_of((number,)) % 2**31, self._system(game), prompt)
         (new,) = calls.ask(self, [question], read)
         return new or game
@@ -67,7 +67,8 @@ def _fields(kind: type[Any]) -> str:
     return "; ".join(words)
 
 
-def metrics_of(table: pa.Table) -> Mapping[str, float]:
-    """Return the means of a table's metrics, without those that are undefined."""
+def _metrics(table: pa.Table) -> list[str]:
+    """Return the means of a table's metrics in words, without those that are undefined."""
     columns = {name: table[name].to_numpy() for name in all_metrics(table)}
-    return {name: float(np.nanmean(values)) for name, values in columns.items() if not np.isnan(values).all()}
+    means = {name: np.nanmean(column) for name, column in columns.items() if not np.isnan(column).all()}
+    return [f"- {name}: {mean:.4g}" for name, mean in means.items()]

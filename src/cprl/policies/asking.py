@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from http.client import HTTPException
 from os.path import isabs
@@ -114,6 +115,8 @@ class Calls:
         self.kept: dict[str, dict[str, Any]] = {}
         """The calls by the hashes of their requests."""
         self._path: Path | None = None
+        self._stored: dict[Path, dict[str, Any]] = {}
+        """The calls of other runs, see `Model.stored`, each run read once."""
         self._most = 0
         """The most calls of the model that was asked last."""
         self._lock = Lock()
@@ -143,32 +146,27 @@ class Calls:
         if new and model.stored is not None:
             self._take(model, new)
         elif new:
-            made = sum(call["tries"] > 0 for call in self.kept.values())
-            count = max(0, model.max_calls - made)
-
-            def make(index: int) -> None:
-                self._make(model, new[index], read, is_allowed=index < count)
-
+            left = model.max_calls - sum(call["tries"] > 0 for call in self.kept.values())
+            most_tries = [1 + model.retries if index < left else 0 for index in range(len(new))]
             with ThreadPoolExecutor(model.concurrency) as pool:
-                list(pool.map(make, range(len(new))))
+                list(pool.map(partial(self._make, model, read), new, most_tries))
         return [_understood(self.kept[name]["answer"], read)[0] for name in hashes]
 
-    def _make(
-        self, model: Model, question: Question, read: Callable[[Any], Any], *, is_allowed: bool
-    ) -> None:
+    def _make(self, model: Model, read: Callable[[Any], Any], question: Question, most_tries: int) -> None:
         """Make a call, and keep what came of it."""
         request = question.request(model)
         began = time.monotonic()
         tries = 0
         outcome = _Outcome(None, OVER_LIMIT)
-        while is_allowed and tries <= model.retries:
+        while tries < most_tries:
             if tries:
                 time.sleep(model.backoff_s * 2 ** (tries - 1))
             tries += 1
             outcome = _post(model, request)
             if not outcome.may_retry:
                 break
-        if outcome.is_refused and all(call["answer"] is None for call in self.kept.values()):
+        # a list, since other threads keep calls meanwhile
+        if outcome.is_refused and all(call["answer"] is None for call in list(self.kept.values())):
             raise ConnectionError(f"{model.base_url} with the model {model.model!r}: {outcome.failure}")
         prompt_price, answer_price = model.prices or (0.0, 0.0)
         self._keep(
@@ -190,7 +188,9 @@ class Calls:
     def _take(self, model: Model, questions: Sequence[Question]) -> None:
         """Take calls from another run; refuse those that it does not keep."""
         path = Path(str(model.stored)) / CALLS
-        stored = read_calls(path)
+        if path not in self._stored:
+            self._stored[path] = read_calls(path)
+        stored = self._stored[path]
         for question in questions:
             request = question.request(model)
             name = _hash(request)

@@ -10,7 +10,7 @@ of the other agents of the world read in later turns.
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal, TypeAlias
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import torch
@@ -43,8 +43,6 @@ _TURN, _NEXT, _HARVEST, _PLAN = range(4)
 """The numbers that an agent carries from turn to turn: the turns of the episode so far, the turn of its next
 plan, its harvest; and where those of the plan begin."""
 _LARGEST_SEED: Final = 2**31
-Said: TypeAlias = dict[tuple[int, int], list[tuple[int, str]]]
-"""What agents said in this episode, turns and messages, by the world in the batch and the agent."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +58,7 @@ class Language(Model):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan(Value, stored=False, called="answer"):
+class Plan(Value, stored=False):
     """What an agent does until the next plan."""
 
     policy: ScriptedPolicy
@@ -74,7 +72,7 @@ class Plan(Value, stored=False, called="answer"):
     """The signal that it sends in each turn, see `Rules.signals`; 0 for none."""
 
 
-def _form(entries: dict[str, tuple[Any, str]], *, talks: bool) -> str:
+def _form(entries: dict[str, Any], *, talks: bool) -> str:
     """Return what a model has to know about the form of its answer.
 
     Args:
@@ -101,11 +99,11 @@ class _BoardPlans:
         self.game = game
         self.talks = game.rules.signals > 0
         """Whether agents send each other messages."""
-        self.fallback: tuple[int, ...] = (*plan_numbers(game, script.policy), 0)
+        self.fallback = (*plan_numbers(game, script.policy), 0)
         """The numbers of the plan of an agent without an answer."""
         self._widest = self.fallback[2:4]
         """The region of an agent that harvests wherever it sees."""
-        self.in_keys: tuple[str, ...] = (keys.HARVEST[1], keys.IN_PLAY[1], *script.in_keys[1:])
+        self.in_keys = (keys.HARVEST[1], keys.IN_PLAY[1], *script.in_keys[1:])
         """The entries of "agents" that it reads beside observations."""
         self._script = script
 
@@ -113,7 +111,7 @@ class _BoardPlans:
         """Return what a model has to know before it answers."""
         rows, columns = self._widest
         where = f"the rows ahead, 0 to {rows}, and columns to each side, 0 to {columns}, where you harvest"
-        entries: dict[str, tuple[Any, str]] = {
+        entries: dict[str, Any] = {
             "policy": ("...", "a name of the list"),
             "spare": (SPARE, "1 to 8"),
             "region": (self._widest, where),
@@ -147,14 +145,10 @@ class _BoardPlans:
 
     def _in_words(self, plan: Sequence[int]) -> str:
         policy, spare, rows, columns, *foes, signal = plan
-        words = [SCRIPTED_POLICIES[policy], f"spare {spare}"]
-        if (rows, columns) != self._widest:
-            words.append(f"region {rows}, {columns}")
-        if can_tag(self.game) and any(foes):
-            words.append(f"tag {np.flatnonzero(foes).tolist()}")
-        if signal:
-            words.append(f"signal {signal}")
-        return ", ".join(words)
+        region = f", region {rows}, {columns}" * ((rows, columns) != self._widest)
+        tag = f", tag {np.flatnonzero(foes).tolist()}" * (can_tag(self.game) and any(foes))
+        said = f", signal {signal}" * bool(signal)
+        return f"{SCRIPTED_POLICIES[policy]}, spare {spare}{region}{tag}{said}"
 
     def _planes(self, observation: AnyArray) -> list[str]:
         """Return in words what the channels beside those of the board show, where the game has them."""
@@ -195,15 +189,15 @@ class _BoardPlans:
 
 
 @dataclass(frozen=True, kw_only=True)
-class _Action(Value, stored=False, called="answer"):
+class _Action(Value, stored=False):
     action: Natural
 
 
 class _PlainActions:
     """Actions in a game that is no `cprl.Game`, which shows its agents numbers; a plan is an action."""
 
-    in_keys: tuple[str, ...] = ()
-    fallback: tuple[int, ...] = (-1,)
+    in_keys = ()
+    fallback = (-1,)
 
     def __init__(self, spaces: Spaces, script: LaneActor) -> None:
         self.talks = spaces.talk
@@ -243,7 +237,8 @@ class LanguageActor(TensorDictModuleBase):
         seeds: the seed of each lane, lane = replica x S + agent.
         agents: the number of agents S of each replica.
         worlds: the number of worlds k of each replica, consecutive in the batch.
-        said: what agents said, of all actors that play the same worlds.
+        said: what agents of all actors that play the same worlds said in this episode, turns and messages, by
+            the world in the batch and the agent.
     """
 
     out_keys = ("action", recurrent_state.AFTER)
@@ -257,7 +252,7 @@ class LanguageActor(TensorDictModuleBase):
         seeds: Sequence[Sequence[int]],
         agents: int,
         worlds: int = 1,
-        said: Said | None = None,
+        said: dict[tuple[int, int], list[tuple[int, str]]] | None = None,
     ) -> None:
         super().__init__()
         self.spec = spec
@@ -276,7 +271,7 @@ class LanguageActor(TensorDictModuleBase):
         self._seeds = [tuple(seed) for seed in seeds]
         self._numbers = [seed[2] for seed in self._seeds[:agents]]
         """The indices of the S agents in the game."""
-        self._said: Said = {} if said is None else said
+        self._said = {} if said is None else said
         self._asked = np.zeros((len(seeds), worlds), np.int64)
         """How often each lane has asked in each world."""
         self.state_cells = _PLAN + len(self._answers.fallback)
@@ -288,9 +283,8 @@ class LanguageActor(TensorDictModuleBase):
         for world, index in np.argwhere(memory[..., _TURN] == 0).tolist():
             self._said[world, self._numbers[index]] = []
         due = (memory[..., _NEXT] <= memory[..., _TURN]) & ~tensordict.get(keys.DONE).numpy(force=True)
-        if keys.HARVEST[1] in self.in_keys:
-            harvest = tensordict.get(keys.HARVEST[1]).numpy(force=True)
-            memory[..., _HARVEST] += harvest
+        if isinstance(self._answers, _BoardPlans):
+            memory[..., _HARVEST] += tensordict.get(keys.HARVEST[1]).numpy(force=True)
             due &= tensordict.get(keys.IN_PLAY[1]).numpy(force=True)
         if due.any():
             self._ask(observation.numpy(force=True), memory, np.argwhere(due))
@@ -302,12 +296,10 @@ class LanguageActor(TensorDictModuleBase):
 
     def _ask(self, observation: AnyArray, memory: Float32, due: Int64) -> None:
         """Ask for the plans of some agents, [n, 2] by world and agent, and write them into the memory."""
-        questions = []
-        for world, index in due.tolist():
-            remembered = memory[world, index]
-            heard = self._heard(world, self._numbers[index], remembered[_TURN])
-            seen = self._answers.seen(observation[world, index], remembered)
-            questions.append(self._question(world, index, "\n".join([*heard, seen])))
+        questions = [
+            self._question(world, index, observation[world, index], memory[world, index])
+            for world, index in due.tolist()
+        ]
         answers = self._calls.ask(self.spec, questions, self._read)
         for (world, index), answer in zip(due.tolist(), answers, strict=True):
             plan, message = answer or (self._answers.fallback, "")
@@ -332,19 +324,21 @@ class LanguageActor(TensorDictModuleBase):
                 lines.append(f"Agent {agent} says: {json.dumps(earlier[-1], ensure_ascii=False)}")
         return lines
 
-    def _question(self, index: int, agent: int, seen: str) -> Question:
-        """Return what an agent of a world of the batch asks, and count it."""
-        replica, world = divmod(index, self.worlds)
-        lane = replica * self.agents + agent
+    def _question(self, row: int, index: int, observation: AnyArray, memory: Float32) -> Question:
+        """Return what an agent asks, by its row and index in the batch, and count it."""
+        replica, world = divmod(row, self.worlds)
+        lane = replica * self.agents + index
         number = int(self._asked[lane, world])
         self._asked[lane, world] += 1
-        run_seed, replica_number, agent_number, *purpose = self._seeds[lane]
+        run_seed, replica_number, agent, *purpose = self._seeds[lane]
         call = (
             f"{Purpose(tuple(purpose)).name.lower()}, seed {run_seed}, replica {replica_number}, "
-            f"world {world}, agent {agent_number}, call {number}"
+            f"world {world}, agent {agent}, call {number}"
         )
         seed = seed_of((*self._seeds[lane], world, number)) % _LARGEST_SEED
-        return Question(call, seed, self._system, seen)
+        heard = self._heard(row, agent, memory[_TURN])
+        prompt = "\n".join([*heard, self._answers.seen(observation, memory)])
+        return Question(call, seed, self._system, prompt)
 
     def get_extra_state(self) -> dict[str, Any]:
         return {"asked": torch.tensor(self._asked), "said": self._said}

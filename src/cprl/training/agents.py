@@ -50,7 +50,6 @@ from cprl.training.stored import (
     PoolActor,
     StoredAgent,
     decision_values,
-    language_agent,
     load,
     stored_actors,
     trained_agent,
@@ -241,7 +240,8 @@ class Population:
             elif isinstance(spec, Script):
                 agents[agent] = [StoredAgent(scripted=spec)] * self.replicas
             elif isinstance(spec, Language):
-                agents[agent] = [language_agent(spec, self.calls)] * self.replicas
+                stored = StoredAgent(scripted=spec.fallback, language=spec, calls=self.calls)
+                agents[agent] = [stored] * self.replicas
             elif isinstance(spec, Frozen):
                 agents[agent] = frozen(spec, governs=agent == self.spaces.agents)
             elif isinstance(spec, Pool):
@@ -283,14 +283,19 @@ class Population:
         others = self._others_as_stored()
         others.pop(self.spaces.agents, None)  # the governor is no agent
         agents = {agent: stored[: len(numbers)] for agent, stored in others.items()}
-        if purpose is Purpose.EXHIBITION:  # viewers cost no calls
-            agents = {agent: list(map(_without_language, stored)) for agent, stored in agents.items()}
         kinds = {
             agent: (getattr(self._specs_by_agent[agent], "run", None), stored[0].kind)
             for agent, stored in agents.items()
         }
         seeds = partial(lane_seeds, self.seed, replicas=numbers, purpose=purpose)
-        return stored_actors(agents, self.playing, kinds=kinds, seeds=seeds, worlds=worlds)
+        return stored_actors(
+            agents,
+            self.playing,
+            kinds=kinds,
+            seeds=seeds,
+            worlds=worlds,
+            asks=purpose is not Purpose.EXHIBITION,  # viewers cost no calls
+        )
 
     def _make_decider(self) -> BanditDecider | None:
         sizes = () if self._game is None else ballot_sizes(self._game)
@@ -354,10 +359,6 @@ class Population:
                 stored = run.agent(stored_agent, replica=stored_replica)
                 weights[lane_name(replica, agent)] = _loadable_weights(stored, algorithm, self.spaces, where)
         return weights
-
-
-def _without_language(agent: StoredAgent) -> StoredAgent:
-    return replace(agent, language=None)
 
 
 def check_scripted(groups: Sequence[tuple[AgentSpec, Any]], spaces: Spaces, game: Game | None) -> None:

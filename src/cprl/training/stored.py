@@ -29,7 +29,7 @@ from cprl.policies.asking import CALLS, Calls
 from cprl.policies.decisions import ballot_sizes, stored_decisions
 from cprl.policies.governors import GovernorActor, Script, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
-from cprl.policies.language import LanguageActor, Said
+from cprl.policies.language import LanguageActor
 from cprl.policies.rng import LaneRng, Purpose, lane_name, lane_seeds
 from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
 from cprl.population import (
@@ -65,7 +65,7 @@ class StoredAgent:
     """The policy that it follows; None for an agent that acts by a network, or a pool."""
     language: Language | None = None
     """How a language model makes its plans, where it falls back to `scripted`; None without one."""
-    calls: Calls | None = field(default=None, repr=False)
+    calls: Calls = field(default_factory=Calls, repr=False)
     """What keeps the calls of its model."""
     network: nn.Module | None = field(default=None, repr=False)
     stochastic: bool = False
@@ -182,7 +182,7 @@ class LoadedRun:
         if isinstance(spec, Scripted):
             return StoredAgent(scripted=spec.policy)
         if isinstance(spec, Language):
-            return language_agent(spec, self.calls)
+            return StoredAgent(scripted=spec.fallback, language=spec, calls=self.calls)
         if isinstance(spec, Person):
             raise ValueError(
                 f"agent {agent} of {self.path} is a person: people cannot be played again; allowed: cprl "
@@ -241,11 +241,6 @@ class LoadedRun:
     def episodes(self) -> pa.Table:
         """Return the table of episodes; see `cprl.runs.episodes.read_episodes`."""
         return read_episodes(self.path)
-
-
-def language_agent(spec: Language, calls: Calls) -> StoredAgent:
-    """Return an agent for which a language model makes plans, and whose calls are kept."""
-    return StoredAgent(scripted=spec.fallback, language=spec, calls=calls)
 
 
 def load(run: str | Path, *, weights: str | None = None) -> LoadedRun:
@@ -457,6 +452,7 @@ def stored_actors(
     seeds: Callable[..., Sequence[Sequence[int]]],
     worlds: int,
     stacks: bool = False,
+    asks: bool = True,
 ) -> dict[ActorAgents, nn.Module]:
     """Return actors for stored agents; agents of one kind are lanes of one actor: lane = replica x agents +
     agent. A pool has an actor of its own.
@@ -467,11 +463,12 @@ def stored_actors(
         seeds: returns the seeds of the lanes of some `agents`.
         stacks: whether lanes with the very same network are stacked too, so that its values equal, to the
             last bit, those beside other networks.
+        asks: whether language models are asked; without, their agents follow the fallback.
     """
     indices_by_kind: dict[Any, list[int]] = {}
     spaces = playing.spaces if isinstance(playing, Game) else playing
     actors: dict[ActorAgents, nn.Module] = {}
-    said: Said = {}
+    said: dict[Any, Any] = {}
     for agent in sorted(agents):
         replicas = agents[agent]
         if replicas[0].pool:
@@ -490,7 +487,7 @@ def stored_actors(
         lanes = list(chain.from_iterable(by_replica))
         size: dict[str, Any] = {"seeds": seeds(agents=indices), "agents": len(indices), "worlds": worlds}
         stored = lanes[0]
-        if stored.language is not None and stored.calls is not None:
+        if stored.language is not None and asks:
             actors[tuple(indices)] = LanguageActor(
                 stored.language, playing, calls=stored.calls, said=said, **size
             )
