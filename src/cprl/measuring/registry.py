@@ -464,7 +464,7 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
     Metric(
         name="governor/rule",
         words="mean of what the governor sets",
-        unit="rate or share",
+        unit="rate, share or level",
         formula=lambda rules, steps, wanted: share_of(rules[..., -1], steps),
         colour=PURPLE,
     ),
