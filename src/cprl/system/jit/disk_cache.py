@@ -4,6 +4,7 @@ Files have a checksum, one process compiles while others wait, and a child proce
 uses private parts of Numba; `tests/system/test_compat.py` has a test for each.
 """
 
+import gc
 import hashlib
 import os
 import pickle
@@ -188,6 +189,7 @@ def compile_for_parent() -> None:
     _is_child = True
     in_child, types = pickle.load(sys.stdin.buffer)
     obey_parent()
+    gc.disable()  # a compilation leaves few cycles, and looking for them takes a tenth of its time
     in_child().compile(types)
 
 
