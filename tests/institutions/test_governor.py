@@ -1,5 +1,7 @@
 """A governor sets a number of another institution, in each world by itself, every few turns."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -15,7 +17,7 @@ from cprl.measuring.registry import (
     compute_metrics,
     metrics_for,
 )
-from cprl.measuring.welfare import wanted_in, welfare
+from cprl.measuring.welfare import welfare
 from cprl.policies.governors import Constant, GovernorActor, StockRule
 
 ROW = ">AAAA"
@@ -175,10 +177,13 @@ def sums(incomes, steps):
     ],
 )
 def test_what_a_governor_wants_of_a_period_of_two_turns(objective, wanted):
-    governor = Governor(sets="tax.rate", objective=objective)
-    assert welfare(governor, INCOMES, np.array([2, 2]), np.ones(2)).tolist() == wanted
-    careful = Governor(sets="tax.rate", objective=objective, least_stock=0.5)
-    assert welfare(careful, INCOMES, np.array([2, 2]), np.array([0.4, 1.0])).tolist() == [0, 0]
+    def welfare_of(stock, **more):
+        governor = Governor(sets="tax.rate", objective=objective, every_steps=2, **more)
+        game = Play(ROW, institutions=[LOST, governor]).game
+        return welfare(game, INCOMES, np.array([2, 2]), np.array(stock) * len(game.map.sites)).tolist()
+
+    assert welfare_of([1.0, 1.0]) == wanted
+    assert welfare_of([0.4, 1.0], least_stock=0.5) == [0, 0]
 
 
 def test_an_episode_has_the_mean_of_what_was_in_force_and_the_objective_of_the_whole():
@@ -187,7 +192,7 @@ def test_an_episode_has_the_mean_of_what_was_in_force_and_the_objective_of_the_w
         "governor/rule",
         "governor/objective",
     )
-    totals = {"rules": np.array([[1.5]]), "steps": np.array([4]), "wanted": wanted_in(play.game)}
+    totals = {"rules": np.array([[1.5]]), "steps": np.array([4]), "wanted": partial(welfare, play.game)}
     paid = {"harvest": [[3.0, 1.0]], "fines": [[0.5, 0.5]], "transfers": [[0.0, 0.0]], "stock_left": [2]}
     found = compute_metrics(totals | {name: np.array(values) for name, values in paid.items()})
     assert found["governor/rule"].tolist() == [0.375]

@@ -31,6 +31,7 @@ The rules, each on one world, and the arrays that they work on:
     actions      an agent's action: walk, turn, fire, clean, signal
     apples       harvest and regrowth
     views        the picture of the board and the observations of agents
+    signals      signals that agents send with their actions
     turn         the order of events in a turn and in an episode
     loops        the loops over worlds that a thread runs
 

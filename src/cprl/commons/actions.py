@@ -15,9 +15,9 @@ from cprl.commons.moves import (
     go_back,
     has_company,
     walk,
-    without_signal,
 )
 from cprl.commons.river import aim_to_clean, is_cleaning
+from cprl.commons.signals import send_signal, without_signal
 from cprl.values.array_types import Int64
 
 if TYPE_CHECKING:
@@ -38,24 +38,20 @@ def act(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch:
         draw_order(world, scratch)
     for turn_place in range(world.row.shape[0]):
         i = scratch.order[turn_place] if tables.clashes == IN_TURN else turn_place
-        act_one(world, tables, actions, scratch, i)
-        if tables.clashes == IN_TURN and world.in_play[i] and has_company(world, i):
-            go_back(world, scratch, i)
-    for i in range(world.row.shape[0]):
-        if law is not None:
-            world.fired[i] = world.fired[i] and law.sanctioner.may_fire[i]
+        act_one(world, tables, law, actions, scratch, i)
         if world.fired[i] or is_cleaning(world.groups.river, i):
             note_shot(world, i)
+        if tables.clashes == IN_TURN and world.in_play[i] and has_company(world, i):
+            go_back(world, scratch, i)
 
 
-def act_one(world: Worlds, tables: Tables, actions: Int64, scratch: Scratch, i: int) -> None:
+def act_one(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch: Scratch, i: int) -> None:
     """Apply the action of agent i if it is in play, and note where it begins the turn."""
     scratch.start_row[i] = world.row[i]
     scratch.start_col[i] = world.col[i]
     world.fired[i] = False
-    action = without_signal(tables, actions[i])
-    if tables.signals > 0:
-        world.signal[i] = actions[i] // tables.silent_actions if world.in_play[i] else 0
+    action = without_signal(actions[i], world.groups.signals)
+    send_signal(world, world.groups.signals, i, actions[i])
     aim_to_clean(world.groups.river, i, world.in_play[i], action)
     if not world.in_play[i]:
         return
@@ -69,6 +65,6 @@ def act_one(world: Worlds, tables: Tables, actions: Int64, scratch: Scratch, i: 
     elif action == TURN_RIGHT:
         world.heading[i] = (world.heading[i] + 1) % 4
     elif action == FIRE and tables.has_beam and not in_cooldown:
-        world.fired[i] = True
+        world.fired[i] = law is None or law.sanctioner.may_fire[i]
         if tables.cooldown_steps > 0:
             world.cooldown[i] = tables.cooldown_steps

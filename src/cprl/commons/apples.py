@@ -17,9 +17,10 @@ from cprl.commons.chance import (
     WORD_SIZE,
     draw,
 )
-from cprl.commons.moves import cell_of, without_signal
+from cprl.commons.moves import cell_of
 from cprl.commons.quirks import keep_old_stock
 from cprl.commons.river import pollute, slowed
+from cprl.commons.signals import Arrays as Signals, without_signal
 from cprl.institutions.hooks import note_apple, note_harvest, note_step, stops_harvest
 from cprl.values.array_types import Float32, Int64
 
@@ -199,7 +200,7 @@ def harvest_apples(world: Worlds, tables: Tables, law: Law | None, actions: Int6
             if (
                 k >= 0
                 and world.stock[k] == 1
-                and harvests(tables, actions[i])
+                and harvests(tables, world.groups.signals, actions[i])
                 and may_be_harvested(law, i, cell, k, world.step[0])
             ):
                 remove_apple(world, tables, law, k)
@@ -209,9 +210,9 @@ def harvest_apples(world: Worlds, tables: Tables, law: Law | None, actions: Int6
                     note_harvest(law, i, cell, k, world.step[0])
 
 
-def harvests(tables: Tables, action: int) -> bool:
+def harvests(tables: Tables, signals: Signals | None, action: int) -> bool:
     """Return whether an action harvests the apple on which the agent stands."""
-    return tables.harvest_number < 0 or tables.harvest_number == without_signal(tables, action)
+    return tables.harvest_number < 0 or tables.harvest_number == without_signal(action, signals)
 
 
 def may_be_harvested(law: Law | None, i: int, cell: int, k: int, step: int) -> bool:

@@ -35,13 +35,6 @@ def is_wall(row: int, col: int, tables: Tables) -> bool:
     return tables.background[cell_of(row, col, tables)] == tables.paints[WALL]
 
 
-def without_signal(tables: Tables, action: int) -> int:
-    """Return an action without the signal that the agent sends with it."""
-    if tables.signals == 0:  # a division takes as long as the rest of an action
-        return action
-    return action % tables.silent_actions
-
-
 def draw_order(world: Worlds, scratch: Scratch) -> None:
     """Draw a permutation of the agents into `scratch.order`, all equally likely, as `shuffle_starts` does."""
     for i in range(world.row.shape[0]):

@@ -11,7 +11,7 @@ import sys
 from dataclasses import dataclass, fields
 from typing import Annotated, Final, Literal, NamedTuple, get_args, get_type_hints
 
-from cprl.commons import quirks, river
+from cprl.commons import quirks, river, signals
 from cprl.commons.chance import Probability
 from cprl.commons.quirks import Quirks2019
 from cprl.commons.river import CLEAN, River
@@ -233,6 +233,7 @@ class RuleGroups(NamedTuple):
 
     river: river.Arrays | None
     quirks: quirks.Arrays | None
+    signals: signals.Arrays | None
 
 
 GROUPS: Final = {

@@ -91,9 +91,6 @@ class Tables(NamedTuple):
     """The number of the word in `Rules.growth`, see `cprl.commons.apples`."""
     first_stock: int
     """The number of sites that hold an apple when an episode begins."""
-    signals: int
-    first_signal_plane: int
-    """The index of the channel that shows the first signal."""
     silent_actions: int
     """The number of actions that send no signal."""
     harvest_number: int
@@ -255,7 +252,6 @@ def _observation_tables(game: "Game", rim: int) -> dict[str, Any]:
         "agents_apart": observation.agents_apart,
         "one_hot": observation.encoding == "one_hot",
         "highest": game.observation_highest,
-        "first_signal_plane": cell_channels,
         "score_begin": plane_size * (cell_channels + rules.signals),
         "scoreboard_cells": plane_size * game.score_channels.count("scoreboard"),
         "stock_gauge_cells": plane_size * game.score_channels.count("stock_gauge"),

@@ -80,7 +80,7 @@ class CpuThreads:
         self.threads = min(threads or os.cpu_count() or 1, most_useful)
         self.tables: Tables = game.tables
         self._worlds = worlds
-        lacks_group = (getattr(game.rules, name) is None for name in RuleGroups._fields)
+        lacks_group = (not getattr(game.rules, name) for name in RuleGroups._fields)
         self._variant: _CodeVariant = (*lacks_group, not game.institutions, runs_plain())
         self._scratch = [empty_scratch(game) for _ in range(self.threads)]
 

@@ -20,7 +20,8 @@ from cprl.commons.moves import (
 )
 from cprl.commons.quirks import ends_late, keep_old_stock
 from cprl.commons.river import begin_river, clean, count_waste, write_waste
-from cprl.commons.views import draw_institutions, draw_scores, draw_signals, draw_windows, has_apple_ahead
+from cprl.commons.signals import draw_signals
+from cprl.commons.views import draw_institutions, draw_scores, draw_windows, has_apple_ahead
 from cprl.commons.world import BEGIN, PLAY, PLAYING, REFRESH, TERMINATED, TRUNCATED
 from cprl.institutions.hooks import begin, open_turn, refresh, settle
 from cprl.institutions.ledger import charge, count_violation, forget_episode, forget_turn
@@ -141,10 +142,9 @@ def ends_by_chance(world: Worlds, tables: Tables) -> bool:
 
 
 def note_events(world: Worlds, output: StepOutput) -> None:
-    """Write which agents fired, and their rewards before institutions; note which are on the board."""
+    """Write which agents fired, and note which are on the board."""
     for i in range(world.row.shape[0]):
         output.fired[i] = world.fired[i]
-        output.reward[i] = output.harvest[i]
         world.on_board[i] = world.in_play[i]
 
 
@@ -161,7 +161,6 @@ def clear_events(world: Worlds, law: Law | None, output: StepOutput) -> None:
     agents = world.row.shape[0]
     for i in range(agents):
         output.harvest[i] = 0.0
-        output.reward[i] = 0.0
         output.fired[i] = False
         for j in range(agents):
             output.hit_by[i, j] = False
@@ -174,9 +173,10 @@ def clear_events(world: Worlds, law: Law | None, output: StepOutput) -> None:
 
 
 def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
-    """Write the current state and every agent's observation into the output."""
+    """Write the current state, every agent's observation, and the rewards before institutions."""
     for i in range(world.row.shape[0]):
         output.in_play[i] = world.in_play[i]
+        output.reward[i] = output.harvest[i]
         if output.apple_ahead.shape[1] > 0:
             output.apple_ahead[i, 0] = has_apple_ahead(world, tables, i)
     output.stock[0] = world.stock_left[0]
@@ -185,8 +185,7 @@ def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scra
     output.truncated[0] = world.ended[0] == TRUNCATED
     output.done[0] = world.ended[0] != PLAYING
     draw_windows(world, tables, scratch, output.observation)
-    if tables.signals > 0:
-        draw_signals(world, tables, scratch, output.observation)
+    draw_signals(world, tables, world.groups.signals, scratch, output.observation)
     if tables.scoreboard_cells + tables.stock_gauge_cells > 0:
         draw_scores(world, tables, output.observation)
 

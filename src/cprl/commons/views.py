@@ -222,26 +222,6 @@ def draw_board(world: Worlds, tables: Tables, scratch: Scratch, board: UInt8) ->
             board[row, col] = class_of(scratch.picture[cell_of(row, col, tables)])
 
 
-def draw_signals(world: Worlds, tables: Tables, scratch: Scratch, observation: UInt8) -> None:
-    """Write a plane for each signal, with the agents that sent it in the last turn.
-
-    `observation`: uint8 [N, C, X, Y]. This runs after `draw_windows` and writes the numbers of signals over
-    the agents in the picture. No paint is one of these small numbers, so they cannot be mistaken for paints.
-    """
-    picture = scratch.picture
-    for i in range(world.row.shape[0]):
-        if world.on_board[i] and world.signal[i] > 0:
-            picture[cell_of(world.row[i], world.col[i], tables)] = world.signal[i]
-    cells = tables.window_cells.shape[1]
-    for i in range(world.row.shape[0]):
-        look(world, tables, i, scratch)
-        planes = observation[i].reshape(-1)
-        for s in range(tables.signals):
-            first = (tables.first_signal_plane + s) * cells
-            for n in range(cells):
-                planes[first + n] = (scratch.seen[n] == s + 1) * tables.highest
-
-
 HIGHEST = 255
 """The largest value in the planes of scores and institutions."""
 
@@ -253,16 +233,16 @@ def draw_scores(world: Worlds, tables: Tables, observation: UInt8) -> None:
     """
     agents = world.row.shape[0]
     sites = world.stock.shape[0]
-    end = tables.score_begin + tables.scoreboard_cells
+    end = tables.scoreboard_cells + tables.stock_gauge_cells
     stock = in_bytes(world.stock_left[0], sites)
     for i in range(agents):
-        planes = observation[i].reshape(-1)
-        for entry in range(agents):
-            harvest = world.harvested[(i + entry) % agents]
-            value = in_bytes(harvest, harvest + sites)
-            for n in range(tables.score_begin + entry, end, agents):
-                planes[n] = value
-        for n in range(end, end + tables.stock_gauge_cells):
+        planes = observation[i].reshape(-1)[tables.score_begin :]
+        for n in range(min(agents, tables.scoreboard_cells)):
+            harvest = world.harvested[(i + n) % agents]
+            planes[n] = in_bytes(harvest, harvest + sites)
+        for n in range(agents, tables.scoreboard_cells):
+            planes[n] = planes[n - agents]
+        for n in range(tables.scoreboard_cells, end):
             planes[n] = stock
 
 

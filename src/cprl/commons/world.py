@@ -164,7 +164,7 @@ def empty_worlds(game: "Game", worlds: int) -> Worlds:
 
 def _empty_group(game: "Game", name: str, sizes: dict[str, int]) -> Any:
     """Return the arrays of a group of rules for new worlds; None if the game lacks the group."""
-    if getattr(game.rules, name) is None:
+    if not getattr(game.rules, name):
         return None
     module = GROUPS[name]
     return filled(module.Arrays, module.parameters(game), **sizes)

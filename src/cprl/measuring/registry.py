@@ -464,7 +464,7 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
     Metric(
         name="governor/rule",
         words="mean of what the governor sets",
-        unit="rate or share",
+        unit="rate, share or level",
         formula=lambda rules, steps, wanted: share_of(rules[..., -1], steps),
         colour=PURPLE,
     ),
@@ -490,7 +490,7 @@ def compute_metrics(totals: Mapping[str, Any], names: Iterable[str] = METRICS) -
 
     Args:
         totals: arrays [..., N] or [...] by the names of `TOTALS`; also the constants "sustainable_yield",
-            "first_stock", "groups" and "wanted" (`cprl.measuring.welfare.wanted_in`) of a game that has them.
+            "first_stock", "groups" and "wanted" (see `EpisodeTracker`) of a game that has them.
         names: the names of the metrics to compute.
     """
     known = {name: value for name, value in totals.items() if value is not None}

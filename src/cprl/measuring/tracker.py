@@ -32,7 +32,7 @@ from cprl.measuring.registry import (
     nested_groups,
     reported_in,
 )
-from cprl.measuring.welfare import wanted_in
+from cprl.measuring.welfare import welfare
 from cprl.values import Custom, Positive, checked, metric_words
 from cprl.values.array_types import AnyArray, Float64, Int64
 
@@ -279,7 +279,8 @@ class EpisodeTracker:
         institutions: those of the game, which determine their metrics, see
             `cprl.measuring.registry.metrics_for`.
         metrics: custom metrics; each names a function of an `Episode` that returns a number.
-        wanted: the objective of the game's governor, see `cprl.measuring.welfare.wanted_in`.
+        wanted: the objective of the game's governor, a function of incomes, turns and the apples left, see
+            `cprl.measuring.welfare`.
 
     Raises:
         ValueError: if a number is below 1; in `add`, if a batch has a wrong shape or lacks an entry.
@@ -520,12 +521,15 @@ def tracker_of(env: EnvBase, metrics: Sequence[Custom] = ()) -> EpisodeTracker:
     """Return an `EpisodeTracker` for all worlds of an environment, with its institutions, its sustainable
     yield, and custom metrics."""
     commons = commons_of(env)
+    wanted = None
+    if commons is not None and commons.game.governor is not None:
+        wanted = partial(welfare, commons.game)
     return EpisodeTracker(
         env.batch_size.numel(),
         agent_count(env),
         institutions=institutions_of(env),
         metrics=metrics,
-        wanted=None if commons is None else wanted_in(commons.game),
+        wanted=wanted,
         **yield_of(env),
     )
 

@@ -101,7 +101,7 @@ class GovernorActor(nn.Module):
         super().__init__()
         self.governor = governor
         self.by: Any = by
-        self._from_turn = from_turn
+        self.from_turn = from_turn
         self.turns = 0
         """The turns so far."""
         self.rule: Tensor | None = None
@@ -113,7 +113,7 @@ class GovernorActor(nn.Module):
         """Return the options in force in the coming turn, int64 [B]; `seen`: float32 [B, S]."""
         if self.rule is None:
             self.rule = torch.zeros(len(seen), dtype=torch.int64, device=seen.device)
-        if self.turns >= self._from_turn and self.turns % self.governor.every_steps == 0:
+        if self.turns >= self.from_turn and self.turns % self.governor.every_steps == 0:
             self.seen = seen
             self.rule = self._choose(seen)
         self.turns += 1

@@ -61,9 +61,10 @@ class Governing:
         """Learns, as the agent after the last one; None for a governor that does not learn."""
         if isinstance(spec, Learning):
             self.learner = instantiate(spec.algorithm).make_learner(lanes, "eager")
-            self.actor = GovernorActor(self._governor, self.learner.actor, from_turn=from_turn)
+            self.actor = GovernorActor(self._governor, self.learner.actor)
         else:
-            self.actor = self._stored_actor(Purpose.EXPLORATION, lanes.worlds, from_turn)
+            self.actor = self._stored_actor(Purpose.EXPLORATION, lanes.worlds)
+        self.actor.from_turn = from_turn
         self._period: dict[str, AnyArray] = {}
         """Of the turns of this period that count, by name: "income" [B, N] and "steps" [B], their sums;
         `_AT_THE_LAST`, as it is after the last of them. Empty before the first."""
@@ -103,8 +104,7 @@ class Governing:
         assert self.actor.seen is not None
         assert self.actor.rule is not None
         period = self._period
-        stock = period[keys.STOCK][:, 0] / len(self._game.map.sites)
-        reward = welfare(self._governor, period["income"], period["steps"], stock)
+        reward = welfare(self._game, period["income"], period["steps"], period[keys.STOCK][:, 0])
         entries = {
             keys.OBSERVATION: self._as_last(self.actor.seen),
             keys.ACTION: self._as_last(self.actor.rule),
@@ -145,10 +145,10 @@ class Governing:
         seeds = self._lanes.agent_seeds(Purpose.RANDOM_PLAY)
         return GovernorActor(self._governor, LaneActor(None, options, seeds=seeds, agents=1, worlds=worlds))
 
-    def _stored_actor(self, purpose: Purpose, worlds: int, from_turn: int = 0) -> GovernorActor:
+    def _stored_actor(self, purpose: Purpose, worlds: int) -> GovernorActor:
         """Return the actor of a governor that does not learn, with random numbers for a purpose."""
         seeds = self._lanes.agent_seeds(purpose)
-        return stored_governor(self._game, self._stored, seeds=seeds, worlds=worlds, from_turn=from_turn)
+        return stored_governor(self._game, self._stored, seeds=seeds, worlds=worlds)
 
     def state_dict(self) -> dict[str, Any]:
         return {

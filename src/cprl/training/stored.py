@@ -414,14 +414,12 @@ def stored_governor(
     *,
     seeds: Sequence[Sequence[int]],
     worlds: int,
-    from_turn: int = 0,
 ) -> GovernorActor:
     """Return the actor of a governor that does not learn.
 
     Args:
         stored: the governor of each replica.
         seeds: the seed of each replica.
-        from_turn: see `GovernorActor`.
     """
     assert game.governor is not None
     by: Any = stored[0].scripted
@@ -433,7 +431,7 @@ def stored_governor(
             worlds=worlds,
             stacks=True,
         ).values()
-    return GovernorActor(game.governor, by, from_turn=from_turn)
+    return GovernorActor(game.governor, by)
 
 
 def decision_values(agents: Mapping[int, Sequence[StoredAgent]]) -> dict[int, list[Tensor]]:
