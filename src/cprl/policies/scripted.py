@@ -223,7 +223,7 @@ class ScriptedActor(ActorOfLanes):
             compiled_for_cpu(scripted_rules.choose_all, inline=False)(
                 policy,
                 epsilon,
-                _roles(tuple(foes))[framed[lanes]],
+                np.take(_roles(tuple(foes)), framed[lanes]),
                 self._frame,
                 numbers[lanes],
                 settings,
