@@ -12,16 +12,28 @@ from bounds import Bound, at_most, board_key, read_bounds, write_bounds
 from changes import PPO_AGENT
 from courses import end_steps
 from finished import name_among
-from judging import FROZEN, LEARNING, MORE_EXPLORATION, Outcomes, contrast, judge, judged_lines, judged_page
+from judging import (
+    FROZEN,
+    LAST,
+    LEARNING,
+    MORE_EXPLORATION,
+    Outcomes,
+    contrast,
+    judge,
+    judged_lines,
+    judged_page,
+)
 from recovery import first_back, recovery_page
 from schedules import exploration_at_end, target_period, updates
 from scipy import stats
 from sheet import sheet
+from tabled import thinned
 
 from cprl import presets
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
 from cprl.experiment import Experiment
 from cprl.institutions import Tax
+from cprl.measuring.table import where
 from cprl.population import Learning, Scripted
 from cprl.studies.tables.tidy_table import StudyDesign, StudyTable
 
@@ -295,6 +307,17 @@ def test_judged_expectations_are_those_of_the_committed_tables(study):
 def test_how_fast_incomes_are_back_is_that_of_the_committed_courses(study):
     page = (RESULTS / study / "recovery.md").read_text(encoding="utf-8")
     assert recovery_page(ROOT / "recipes" / "study" / "governs" / f"{study}.py") == page
+
+
+def test_a_thinned_table_keeps_every_so_many_windows_and_the_end_of_each_replica():
+    whole = StudyTable.read(RESULTS / "best_response" / "table.parquet", last=LAST)
+    thin = thinned(whole, 4)
+    assert thin.windows().equals(whole.windows())
+    assert thin.windows("evaluation").equals(whole.windows("evaluation"))
+    trained, left = (len(where(table.rows, part="training")) for table in (whole, thin))
+    assert trained / 4 < left < trained / 2
+    committed = StudyTable.read(RESULTS / "shocks" / "table.parquet", last=LAST)
+    assert thinned(committed, 4).rows.equals(committed.rows)
 
 
 @pytest.mark.integration
