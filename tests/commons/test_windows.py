@@ -142,7 +142,7 @@ def test_as_run_the_mark_of_a_later_agent_covers_an_earlier_agent():
 
 def test_boards_show_the_classes_of_all_cells():
     play = Play("A.#\n.>.\n...")
-    shown = play.batch.boards(play.output)[0]
+    shown = play.batch.boards()[0]
     expected = [[APPLE, GROUND, WALL], [GROUND, OTHER, MARK], [GROUND, GROUND, GROUND]]
     assert np.array_equal(shown, expected)
 

@@ -191,7 +191,7 @@ class Batch:
             self.game.rules.episode_steps,
         )
 
-    def boards(self, output: StepOutput) -> UInt8:
+    def boards(self) -> UInt8:
         """Return the current boards as classes of cells (`cprl.commons.cells`): uint8 [B, H, W]."""
         boards = self.driver.empty((self.size, self.game.map.height, self.game.map.width), np.uint8)
         self.driver.show((self.now, self.driver.tables, boards))
@@ -202,7 +202,7 @@ class Batch:
         read = self.driver.read
         return WorldView(
             read(output.observation[world]),
-            read(self.boards(output))[world],
+            read(self.boards())[world],
             *(read(getattr(self.now, name))[world] for name in WorldView._fields[2:]),
         )
 

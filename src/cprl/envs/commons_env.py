@@ -227,7 +227,7 @@ class CommonsEnv(LeanStepEnv):
         if self.game.governor is not None:
             entries[keys.SEEN] = torch.as_tensor(self.worlds.seen(), device=self.device)
         if self._has_state:
-            boards = torch.as_tensor(self.worlds.boards(self.output), device=self.device)
+            boards = torch.as_tensor(self.worlds.boards(), device=self.device)
             entries[keys.STATE] = self._colours[boards.long()].permute(0, 3, 1, 2)
         entries[keys.AGENTS] = unchecked_tensordict(agents, self._agents_size, self.device)
         return unchecked_tensordict(entries, self.batch_size, self.device)

@@ -192,7 +192,7 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
     def state(self) -> UInt8:
         """Return the whole board as colours in RGB, one pixel per cell: uint8 [3, H, W]."""
         self._check_begun("state()")
-        board = self.game.palette[self.batch.boards(self.output)[0]]
+        board = self.game.palette[self.batch.boards()[0]]
         return np.ascontiguousarray(board.transpose(2, 0, 1))
 
     def render(self) -> UInt8:
