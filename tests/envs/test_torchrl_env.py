@@ -205,18 +205,6 @@ def test_a_game_without_institutions_has_none_of_their_entries():
     assert not names & {"fines", "transfers", "violated", "counts", "decision", "in_force"}
 
 
-def test_the_worlds_are_in_the_state_dict_of_the_environment():
-    first = CommonsEnv(GOVERNED, 3, seed=4)
-    second = CommonsEnv(GOVERNED, 3, seed=5)
-    first.rollout(7)
-    second.reset()
-    second.load_state_dict(first.state_dict())
-    for name, array in first.worlds.state().items():
-        assert np.array_equal(second.worlds.state()[name], array), name
-    with pytest.raises(RuntimeError, match="_extra_state"):
-        second.load_state_dict({})
-
-
 def test_what_was_kept_is_restored_whole():
     assert_restorable(lambda: CommonsEnv(GOVERNED, 3, seed=4))
     assert_restorable(lambda: make_env(RICH, worlds=2, seed=4, transforms=[StepCounter()]))

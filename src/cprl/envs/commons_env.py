@@ -59,6 +59,9 @@ class CommonsEnv(LeanStepEnv):
     world whose episode has ended does not change that world. Every step writes to new tensors, so a
     TensorDict from an earlier step never changes.
 
+    `env.worlds.state()` returns the state of all worlds, and `load` restores it. The `state_dict` of torch is
+    empty: TorchRL's `EnvCreator` hands that of one environment to all workers, whose worlds must differ.
+
     Args:
         worlds: the number of worlds B.
         seed: the seed of all random numbers; `set_seed` restarts from another seed. None draws a seed from
@@ -281,15 +284,6 @@ class CommonsEnv(LeanStepEnv):
         self._set_output(tensors, output)
         return self._as_tensordict(tensors)
 
-    def get_extra_state(self) -> dict[str, Tensor]:
-        """Return the state of all worlds, tensors by name, as the part of `state_dict` that is this
-        environment's."""
-        return {name: _as_tensor(array) for name, array in self.worlds.state().items()}
-
-    def set_extra_state(self, state: Mapping[str, Any]) -> None:
-        """Set all worlds to a result of `get_extra_state`, see `load`."""
-        self.load({name: _as_saved(name, tensor) for name, tensor in state.items()})
-
     def render(self, *, world: int | None = None, cell_pixels: int = 24) -> UInt8:
         """Return images of the current boards, e.g. for TorchRL's `PixelRenderTransform`.
 
@@ -372,19 +366,3 @@ class CommonsEnv(LeanStepEnv):
         is_first = done if resets else None
         carry_on(next_input, tensordict, is_first, _WRITTEN_ENTRIES)
         return tensordict, next_input
-
-
-_UNSIGNED_ARRAYS: Final = ("seed", "number")
-"""The names of the arrays of a state that are uint64."""
-
-
-def _as_tensor(array: NDArray[Any]) -> Tensor:
-    """Return a tensor of the same bytes; uint64 becomes int64, which all of torch's functions know."""
-    return torch.from_numpy(array.view(np.int64) if array.dtype == np.uint64 else array)
-
-
-def _as_saved(name: str, tensor: Any) -> Any:
-    """Return the array from which `_as_tensor` made a tensor, by the name that it has in a state."""
-    if name in _UNSIGNED_ARRAYS and isinstance(tensor, Tensor) and tensor.dtype == torch.int64:
-        return tensor.numpy(force=True).view(np.uint64)
-    return tensor

@@ -4,6 +4,9 @@ from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any, Final
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.parameter import is_lazy
 from torchrl.envs import Compose, EnvBase, TransformedEnv
@@ -15,7 +18,10 @@ def env_state(env: EnvBase) -> dict[str, Any]:
     """Return everything that decides how an environment goes on, apart from the TensorDict that it is stepped
     with: the worlds and the transforms, as tensors, numbers, lists and dicts."""
     commons = commons_of(env)
-    worlds = dict(base_env(env).state_dict()) if commons is None else commons.get_extra_state()
+    if commons is None:
+        worlds = dict(base_env(env).state_dict())
+    else:
+        worlds = {name: _tensor(array) for name, array in commons.worlds.state().items()}
     return {"worlds": worlds, "transforms": _complete_transforms_state(env)}
 
 
@@ -25,7 +31,7 @@ def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
     if commons is None:
         base_env(env).load_state_dict(state["worlds"])
     else:
-        commons.set_extra_state(state["worlds"])
+        commons.load({name: _array(name, tensor) for name, tensor in state["worlds"].items()})
     if isinstance(env, TransformedEnv):
         _load(env, dict(state["transforms"]))
 
@@ -77,3 +83,20 @@ def _load(env: TransformedEnv, state: dict[str, Any]) -> None:
             f"the state of the transforms {kinds} lacks, or has beyond theirs, {', '.join(unmatched)}; "
             "allowed: transforms whose load_state_dict takes what their state_dict gives"
         )
+
+
+def _array(name: str, tensor: Any) -> Any:
+    """Return the array from which `_tensor` made a tensor, by the name that the array has in a state."""
+    if name in _UNSIGNED_ARRAYS and isinstance(tensor, Tensor) and tensor.dtype == torch.int64:
+        return tensor.numpy(force=True).view(np.uint64)
+    return tensor
+
+
+_UNSIGNED_ARRAYS: Final = ("seed", "number")
+"""The names of the arrays of a state that are uint64."""
+
+
+def _tensor(array: NDArray[Any]) -> Tensor:
+    """Return a tensor of the same bytes; uint64 becomes int64, which all of torch's functions know."""
+    signed = array.view(np.int64) if array.dtype == np.uint64 else array
+    return torch.from_numpy(signed)
