@@ -31,12 +31,12 @@ The rules, each on one world, and the arrays that they work on:
     actions      an agent's action: walk, turn, fire, clean, signal
     apples       harvest and regrowth
     views        the picture of the board and the observations of agents
-    signals      signals that agents send with their actions
     turn         the order of events in a turn and in an episode
     loops        the loops over worlds that a thread runs
 
 Groups of rules that are off by default have a module each, see `RuleGroups` in rules: `river`, about waste in
-a river and its cleaning, and `quirks`, in which the program of 2019 differs from its paper.
+a river and its cleaning, `signals`, which agents send each other, and `quirks`, in which the program of 2019
+differs from its paper.
 
 How the rules are run, which `cprl.system.jit` compiles:
 
