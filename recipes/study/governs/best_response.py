@@ -20,7 +20,7 @@ from changes import NOTHING, STUDY as CHANGES
 
 import cprl
 from cprl.algorithms import DQN
-from cprl.population import Learning
+from cprl.population import Frozen, Learning
 
 RULES: Final = {
     "no rule": NOTHING,
@@ -39,25 +39,41 @@ EXPECTED: Final[dict[str, tuple[Sign, str]]] = {
 }
 
 
+def responders(replaced: Frozen) -> dict[str, Learning]:
+    """Return who learns a response in the place of an agent, by what it starts from."""
+    return {"a copy": replace(COPY, start_from=replaced), "nothing": AGENT}
+
+
+def gain(label: str, *, responder: str, incumbents: str, sign: Sign, why: str) -> Expectation:
+    """Return what is expected of the income of agent 0 in a condition, beside that of whom it replaced."""
+    return Expectation(
+        label=label,
+        more=(responder,),
+        less=(incumbents,),
+        sign=sign,
+        why=why,
+        metric="agent_0/return",
+        margin=MARGIN / 4,
+    )
+
+
 def conditions() -> dict[str, dict[str, Any]]:
     table = {}
     games = {condition.name: condition.experiment.game for condition in CHANGES.all_conditions}
     for rule, named in RULES.items():
         replaced, *others = trained(CHANGES, named)
-        for start, responder in (("a copy", replace(COPY, start_from=replaced)), ("nothing", AGENT)):
+        for start, responder in responders(replaced).items():
             table[f"{rule}, from {start}"] = {"game": games[named], "agents": (responder, *others)}
     return table
 
 
 EXPECTATIONS: Final = tuple(
-    Expectation(
-        label=f"gain under {rule}, from {start}",
-        more=(f"{rule}, from {start}",),
-        less=(f"changes/{RULES[rule]}",),
+    gain(
+        f"gain under {rule}, from {start}",
+        responder=f"{rule}, from {start}",
+        incumbents=f"changes/{RULES[rule]}",
         sign=sign,
         why=why,
-        metric="agent_0/return",
-        margin=MARGIN / 4,
     )
     for rule, (sign, why) in EXPECTED.items()
     for start in ("a copy", "nothing")

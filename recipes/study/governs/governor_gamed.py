@@ -15,8 +15,8 @@ family of all 8, by Holm's method.
 from dataclasses import replace
 from typing import Any, Final
 
-from asking import AGENT, EXPERIMENT, GAME, MARGIN, Expectation, expected_text, trained
-from best_response import COPY
+from asking import EXPERIMENT, GAME, Expectation, expected_text, trained
+from best_response import gain, responders
 from changes import PPO_AGENT
 from governor import LEARNED, STUDY as GOVERNOR
 from governor_kept import LEARNED as RULES
@@ -33,7 +33,7 @@ def conditions() -> dict[str, dict[str, Any]]:
         game = replace(GAME, institutions=institutions)
         replaced, *others = trained(GOVERNOR, f"{rule} learned")
         governor = Frozen(replaced.run, GAME.agents, replica=None)
-        for start, responder in (("a copy", replace(COPY, start_from=replaced)), ("nothing", AGENT)):
+        for start, responder in responders(replaced).items():
             agents = (responder, *others)
             table[f"{rule}, from {start}"] = {"game": game, "agents": agents, "governor": governor}
         ppo_agents = (PPO_AGENT,) * GAME.agents
@@ -47,14 +47,12 @@ EXPECTATIONS: Final = tuple(
     for rule in RULES
     for expected in (
         *(
-            Expectation(
-                label=f"gain under the learned {rule}, from {start}",
-                more=(f"{rule}, from {start}",),
-                less=(f"governor/{rule} learned",),
+            gain(
+                f"gain under the learned {rule}, from {start}",
+                responder=f"{rule}, from {start}",
+                incumbents=f"governor/{rule} learned",
                 sign="same",
                 why="one agent of four moves little of what the governor sees",
-                metric="agent_0/return",
-                margin=MARGIN / 4,
             )
             for start in ("a copy", "nothing")
         ),

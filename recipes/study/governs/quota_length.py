@@ -13,11 +13,10 @@ from dataclasses import replace
 from typing import Final
 
 from asking import EXPERIMENT, SETTINGS, STEPS, Expectation, expected_text
-from quota_size import NOTHING, name
+from quota_size import NOTHING, conditions, name
 
 import cprl
 from cprl.algorithms import DQN
-from cprl.institutions import Quota
 from cprl.population import Learning
 
 TIMES: Final = 10
@@ -65,10 +64,7 @@ EXPECTATIONS: Final = (
 
 STUDY = cprl.Study(
     replace(EXPERIMENT, agents=(AGENT,) * 4, steps=TIMES * STEPS),
-    conditions={
-        NOTHING: {},
-        **{name(share): {"game.institutions": (Quota(share=share, window_steps=50),)} for share in SHARES},
-    },
+    conditions=conditions(SHARES),
     name="quota_length",
     question="How large must a quota be where agents learn for as long as published?",
     expectation=expected_text(EXPECTATIONS),

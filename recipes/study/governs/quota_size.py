@@ -9,7 +9,8 @@ A share of s allows floor(s x 27.8) apples for each agent in 50 turns, so an epi
 does not, or a looser one that beats the tightest by more than the margin.
 """
 
-from typing import Final
+from collections.abc import Sequence
+from typing import Any, Final
 
 from asking import EXPERIMENT, Expectation, expected_text
 
@@ -22,6 +23,12 @@ SHARES: Final = (0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8)
 
 def name(share: float) -> str:
     return f"share {share:g}"
+
+
+def conditions(shares: Sequence[float]) -> dict[str, dict[str, Any]]:
+    """Return the condition without a quota, and one for each share."""
+    quotas = {name(share): Quota(share=share, window_steps=50) for share in shares}
+    return {NOTHING: {}, **{label: {"game.institutions": (quota,)} for label, quota in quotas.items()}}
 
 
 EXPECTATIONS: Final = (
@@ -63,10 +70,7 @@ EXPECTATIONS: Final = (
 
 STUDY = cprl.Study(
     EXPERIMENT,
-    conditions={
-        NOTHING: {},
-        **{name(share): {"game.institutions": (Quota(share=share, window_steps=50),)} for share in SHARES},
-    },
+    conditions=conditions(SHARES),
     name="quota_size",
     question="How large must a quota be that nobody can exceed?",
     expectation=expected_text(EXPECTATIONS),
