@@ -7,7 +7,7 @@ A package imports only from those above it:
     recurrent_state  the states of recurrent networks from turn to turn: written, carried, read
     institutions  rules that people make: boundaries, quotas, taxes, sanctions, votes; numpy alone
     commons      the game: maps, rules, turns; numpy and numba alone
-    pictures     games for people: boards as images and SVG, rules in words, the colours of all pictures
+    pictures     games for people: boards as images, rules in words, the colours of all pictures
     envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
     networks     from observations to numbers
     objectives   what agents want, and losses that TorchRL lacks: log-cosh, MADDPG, PR2, LOLA

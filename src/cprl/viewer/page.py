@@ -82,9 +82,11 @@ class WebViewer:
         )
         Thread(target=self._server.serve_forever, daemon=True).start()
         self.port = self._server.server_port
+        self.native = [viewer(), "--connect", *sources]
+        """The command of Rerun's native viewer."""
         self.addresses = {
             "browser": f"http://{LOCALHOST}:{self.port}/",
-            "native": quote_command([viewer(), "--connect", *sources]),
+            "native": quote_command(self.native),
         }
         """The address for a "browser", and the command line of Rerun's "native" viewer."""
 

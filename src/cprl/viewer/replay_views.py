@@ -18,7 +18,7 @@ from cprl.pictures.colours import agent_colour
 from cprl.policies.actors import LaneActor
 from cprl.policies.joint_policy import JointPolicy, agent_indices
 from cprl.values.array_types import Float32, Float64
-from cprl.viewer.board import centres_of
+from cprl.viewer.board import centres_of, image_format
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import BOARD_BACKGROUND, GIVEN, PAID
 from cprl.viewer.scene import BAR_GAP, BAR_HIGH, BAR_WIDE, Scene, decision_panels
@@ -107,9 +107,7 @@ class Decisions:
 
     def _log_static_parts(self) -> None:
         """Log the format of the image, the classes of its bars, and the names of actions."""
-        rows, columns = self._panels.shape
         kind = rr.ChannelDatatype.U16 if self._dtype is np.uint16 else rr.ChannelDatatype.U8
-        form = rr.components.ImageFormat(width=columns, height=rows, channel_datatype=kind)
         classes = [rr.AnnotationInfo(id=0, label="", color=BOARD_BACKGROUND)]
         for agent, name in enumerate(self._names):
             hue = tuple(round(_BAR_BRIGHTNESS * channel) for channel in agent_colour(agent))
@@ -119,7 +117,7 @@ class Decisions:
                 taken_label = f"{name} takes: {action_name}"
                 classes.append(rr.AnnotationInfo(id=bar_class, label=label, color=hue))
                 classes.append(rr.AnnotationInfo(id=bar_class + 1, label=taken_label, color=_WHITE))
-        image = rr.SegmentationImage.from_fields(format=form, opacity=1.0)
+        image = rr.SegmentationImage.from_fields(format=image_format(self._panels.shape, kind), opacity=1.0)
         self._logger.log_static(_DECISIONS, rr.AnnotationContext(classes), image)
         self._logger.log_static(f"{_DECISIONS}/labels", self._panels.labels())
         if len(self._names) <= _MOST_LABELLED:

@@ -105,7 +105,7 @@ class JoinRefusedError(Exception):
 class Budget:
     """A limit of messages: so many a second, and so many at once."""
 
-    def __init__(self, rate: float = 20.0, most: float = 40.0) -> None:
+    def __init__(self, rate: float, most: float) -> None:
         self.rate = rate
         self._most = most
         self._left = most
@@ -127,6 +127,7 @@ class Seat:
 
     group: int
     agent: int
+    budget: Budget
     code: str = ""
     secret: str = ""
     """The digest of its secret; "" for a seat that is free."""
@@ -141,7 +142,6 @@ class Seat:
     number: int = 0
     vote: int = NONE
     view: str = ""
-    budget: Budget = field(default_factory=Budget)
 
     def kept(self) -> dict[str, Any]:
         """Return what the session's file says of the person."""
