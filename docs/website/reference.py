@@ -40,7 +40,7 @@ REFERENCE: Final = {
 """A page each, in reading order, and what it is about."""
 
 _MODULES: Final = {
-    "commons": ("maps", "published", "observation", "rules", "game", "spaces", "state"),
+    "commons": ("maps", "named_games", "observation", "rules", "game", "spaces", "state"),
     "envs": ("make_env",),
     "experiment": ("presets",),
     "experimental": (
@@ -57,7 +57,7 @@ _MODULES: Final = {
 }
 """Modules of a package that its page shows too, beside what the package exports."""
 
-INTERNAL: Final = {"system", "recurrent_state", "pictures", "runs", "terminal", "commands", "__main__"}
+INTERNAL: Final = {"system", "pictures", "runs", "terminal", "commands", "__main__"}
 """Packages that no page shows: users reach what they hold by the names of `cprl` or by a command."""
 
 

@@ -12,9 +12,8 @@ from typing import Annotated, Any, TypeAlias
 import torch
 from torch import Tensor
 
-from cprl import recurrent_state
 from cprl.commons.spaces import Spaces
-from cprl.keys import Turn
+from cprl.keys import Turn, recurrent_state
 from cprl.learners.transitions import LaneTurn, TransitionForm, joint_actions_by_agent, lane_turn
 from cprl.objectives.rewards import Reward, check_reward
 from cprl.policies.rng import Purpose, lane_names, lane_seeds

@@ -16,12 +16,12 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl import keys, recurrent_state
+from cprl import keys
 from cprl.commons.spaces import Spaces
 from cprl.envs.env_state import env_state, load_env_state, load_transforms_state, transforms_state
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.unwrap import commons_of
-from cprl.keys import Turn
+from cprl.keys import Turn, recurrent_state
 from cprl.learners.protocol import AnyLearner
 from cprl.measuring.series import Observer
 from cprl.measuring.tracker import Episode, example_episode, tracker_of, with_missing
@@ -182,7 +182,9 @@ class Training:
         self._shaped_returns = ShapedReturns(env.batch_size.numel(), spaces.agents, self.learners)
         for learner in self.learners.values():
             learner.begin()
-        all_learners = self.learners if governor is None else {**self.learners, **governor.learners}
+        all_learners = dict(self.learners)
+        if governor is not None and governor.learner is not None:
+            all_learners[governor.learner.agents] = governor.learner
         self.finite = FiniteCheck(all_learners, spaces, worlds=schedule.worlds, on_nan=schedule.on_nan)
         self.observer = Observer(callbacks, env, worlds=schedule.worlds)
         """The caller of the callbacks."""

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import nn
 
-from cprl import keys, recurrent_state
+from cprl import keys
 from cprl.envs.commons_env import CommonsEnv
+from cprl.keys import recurrent_state
 from cprl.measuring.registry import FINES_TOTAL, TRANSFERS_TOTAL
 from cprl.measuring.tracker import Episode
 from cprl.pictures.colours import agent_colour

@@ -9,7 +9,7 @@ from typing import Literal, TypeAlias
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.evaluation.fresh import typical_replica
-from cprl.evaluation.play import board_named
+from cprl.evaluation.play import game_and_run
 from cprl.institutions import Institution
 from cprl.policies.governors import Script
 from cprl.policies.scripted import ScriptedPolicy
@@ -45,7 +45,7 @@ class HostedSession(Hosting, stored=False, called="session"):
     @cached_property
     def _base(self) -> tuple[Game, LoadedRun | None]:
         """The game before any treatment, and the run whose game it is."""
-        return board_named(self.game, "published") if isinstance(self.game, str) else (self.game, None)
+        return game_and_run(self.game, "published") if isinstance(self.game, str) else (self.game, None)
 
     def games(self) -> list[tuple[str, Game]]:
         """Return the name and the game of each round, with a start for each agent.
