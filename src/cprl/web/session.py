@@ -44,7 +44,7 @@ class HostedSession(Hosting, stored=False, called="session"):
 
     @cached_property
     def _base(self) -> tuple[Game, LoadedRun | None]:
-        """The game before any treatment, and the run whose game it is."""
+        """Return the game before any treatment, and the run whose game it is."""
         return game_and_run(self.game, "published") if isinstance(self.game, str) else (self.game, None)
 
     def games(self) -> list[tuple[str, Game]]:
