@@ -204,7 +204,7 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
 
     (tmp_path / "recipe.json").write_text("{}")
     env, common = CommonsEnv(GAME, 2), {"title": "run", "episodes": 70}
-    with ViewerCallback(tmp_path, env, file_name="whole.rrd", **common) as whole:
+    with ViewerCallback(tmp_path / "whole", env, **common) as whole:
         play(range(70), observing(whole))
     with ViewerCallback(tmp_path, env, **common) as first:
         observer = observing(first)
@@ -224,7 +224,7 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
         seen_by_viewers(second.logger, tmp_path / "seen", "social/collective_return", list(range(70)))
     files = [tmp_path / name for name in ("run.rrd", "run-2.rrd")]
     assert len({RrdReader(file).recordings()[0].recording_id for file in files}) == 1
-    complete, resumed = tmp_path / "whole.rrd", files[1]
+    complete, resumed = tmp_path / "whole" / "run.rrd", files[1]
     assert headers(resumed)[1][1].startswith("#### Episode 49 of 70 · falling · ")
     assert headers(resumed)[-20:] == headers(complete)[-20:]
     for name in ("social/collective_return", "agent_0/return"):

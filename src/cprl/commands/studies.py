@@ -244,6 +244,9 @@ def recipe_of(source: Path) -> "Callable[..., Experiment]":
     Args:
         source: a Python file with a function `experiment`, which is imported; a recipe.json; or the directory
             of a run.
+
+    Raises:
+        ValueError: for anything else.
     """
     if source.suffix != ".py" or source.is_dir():
         directory = source if source.is_dir() else source.parent
@@ -293,7 +296,11 @@ _CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
 
 
 def executor_of(options: TrialOptions) -> "Executor":
-    """Return the executor for the options --on, --jobs and --address."""
+    """Return the executor for the options --on, --jobs and --address.
+
+    Raises:
+        ValueError: for options that do not go together.
+    """
     from cprl.studies.executors import InProcess, Processes
 
     jobs = 1 if options.jobs is None else checked("--jobs", options.jobs, Annotated[int, Range(1, 4096)])

@@ -99,8 +99,7 @@ def _record_to_file(fresh: FreshEpisode, target: Path) -> Episode:
         title=f"{legible(fresh.run.path.name)}, replica {fresh.replica}, episode {fresh.episode}",
         episodes=1,
         recipe=fresh.run.recipe,
-        file_name=target.name,
-        is_replay=True,
+        replay=target.name,
     ) as viewer:
         logger = viewer.logger
         scene = logger.scene

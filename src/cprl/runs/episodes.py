@@ -88,7 +88,12 @@ class EpisodeTable:
         self._open(int(state["rows"]))
 
     def add(self, *episodes: Episode) -> None:
-        """Append episodes; the first one of a table determines the columns and metrics of all."""
+        """Append episodes; the first one of a table determines the columns and metrics of all.
+
+        Raises:
+            OSError: if they cannot be written; the earlier ones are intact.
+            ValueError: for an episode with other columns.
+        """
         if not episodes:
             return
         journal = self._open_journal or self._open()  # start over if there was no checkpoint
@@ -305,7 +310,11 @@ def schema_of(episode: Episode) -> pa.Schema:
 
 
 def rows_of(episodes: Sequence[Episode], schema: pa.Schema) -> pa.RecordBatch:
-    """Return a row for each episode and agent, with the schema of the table's first episode."""
+    """Return a row for each episode and agent, with the schema of the table's first episode.
+
+    Raises:
+        ValueError: for an episode with other columns.
+    """
     columns_of_episodes = list(map(_columns, episodes))
     for columns in columns_of_episodes:
         if columns.keys() != set(schema.names):

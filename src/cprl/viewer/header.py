@@ -208,12 +208,12 @@ class HeaderView(View):
         self._random_result = fresh_result(episodes, replicas=self._curves.replicas)
         self.course.random_play = self._random_result.harvest.value
         self._logger.log_text(f"random play {self._describe(self._random_result)}")
-        if not self._ended:
-            self.begins(BEGINS)
+        self.begins(BEGINS)
 
     def begins(self, status: str) -> None:
-        """Show a status in the live header before the first episode ends, e.g. "compiling, 12 s so far"."""
-        self._logger.show_header(self._line(status))
+        """Show a status in the live header, e.g. "compiling, 12 s so far", unless an episode has ended."""
+        if not self._ended:
+            self._logger.show_header(self._line(status))
 
     def change_rules(self, rules: str) -> None:
         """Name other institutions in the header from now on."""

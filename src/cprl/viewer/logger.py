@@ -294,7 +294,11 @@ class RerunLogger(Logger):
             stream.buffer.setdefault(name, []).append((step, self.episode, self.frames, values))
 
     def log_frames(self, frames: Frames) -> None:
-        """Log recorded frames, as `cprl.viewer.board.FrameRecorder.take` returns them."""
+        """Log recorded frames, as `cprl.viewer.frames.FrameRecorder.take` returns them.
+
+        Raises:
+            ValueError: if the recording shows no board.
+        """
         if self.scene is None:
             raise ValueError("the logger has no scene; pass a Scene as curves to log frames")
         frame_numbers = np.arange(self.frames, self.frames + len(frames["step"]))
@@ -316,6 +320,9 @@ class RerunLogger(Logger):
 
         A video starts after the last image of an earlier one with the same name, because TorchRL's recorders
         pass the number of the video as its step.
+
+        Raises:
+            ValueError: for a video of another shape.
         """
         images = torch.as_tensor(video).cpu()
         images = images[0] if images.ndim == 5 else images

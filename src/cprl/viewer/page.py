@@ -206,6 +206,9 @@ def check_watch(watch: str, *, linger: bool = False, can_be_off: bool = True) ->
         linger: whether the recording stays served after the run. That needs a served recording, and the main
             thread, which waits for the signal to stop.
         can_be_off: whether "off" is allowed.
+
+    Raises:
+        ValueError: for another word, and where `linger` is not possible.
     """
     allowed: Any = Literal["file", Served, "off"] if can_be_off else Literal["file", Served]
     checked("watch", watch, allowed)

@@ -63,9 +63,7 @@ class Decisions:
         self._actions = tuple(actions)
         self._actors = list(zip(map(agent_indices, policies.indices), policies.actors, strict=True))
         self._panels = decision_panels(len(scene.agents), len(actions), scene.window)
-        needs_16_bits = 2 * len(scene.agents) * len(actions) > np.iinfo(np.uint8).max
-        self._dtype = np.uint16 if needs_16_bits else np.uint8
-        self._images: list[NDArray[np.unsignedinteger[Any]]] = []
+        self._images: list[NDArray[np.uint16]] = []
         self._texts: list[str] = []
         """The texts of all agents, one frame after the other."""
         self._step = 0
@@ -77,7 +75,7 @@ class Decisions:
         if self._step == 1:
             return  # frames begin after the first turn, so no frame shows the first observations
         actions = batch[keys.ACTION][0].tolist()
-        image = np.zeros(self._panels.shape, self._dtype)
+        image = np.zeros(self._panels.shape, np.uint16)
         texts = list(self._names)
         for agents, actor in self._actors:
             for agent, (heights, text) in zip(agents, _bars(actor, batch, list(agents)), strict=True):
@@ -108,7 +106,6 @@ class Decisions:
 
     def _log_static_parts(self) -> None:
         """Log the format of the image, the classes of its bars, and the names of actions."""
-        kind = rr.ChannelDatatype.U16 if self._dtype is np.uint16 else rr.ChannelDatatype.U8
         classes = [rr.AnnotationInfo(id=0, label="", color=BOARD_BACKGROUND)]
         for agent, name in enumerate(self._names):
             hue = tuple(round(_BAR_BRIGHTNESS * channel) for channel in agent_colour(agent))
@@ -118,7 +115,9 @@ class Decisions:
                 taken_label = f"{name} takes: {action_name}"
                 classes.append(rr.AnnotationInfo(id=bar_class, label=label, color=hue))
                 classes.append(rr.AnnotationInfo(id=bar_class + 1, label=taken_label, color=_WHITE))
-        image = rr.SegmentationImage.from_fields(format=image_format(self._panels.shape, kind), opacity=1.0)
+        image = rr.SegmentationImage.from_fields(
+            format=image_format(self._panels.shape, rr.ChannelDatatype.U16), opacity=1.0
+        )
         self._logger.log_static(_DECISIONS, rr.AnnotationContext(classes), image)
         self._logger.log_static(f"{_DECISIONS}/labels", self._panels.labels())
         if len(self._names) <= _MOST_LABELLED:
