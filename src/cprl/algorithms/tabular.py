@@ -16,7 +16,6 @@ class Tabular(Algorithm):
     """Tabular Q-learning; see `TabularLearner`."""
 
     settings: TabularSettings
-    settings_kind = TabularSettings
 
     def make_network(self, spaces: Spaces) -> TableNetwork:
         return table_network(spaces)
