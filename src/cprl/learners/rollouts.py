@@ -213,18 +213,19 @@ class Rollouts:
         def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
             return torch.zeros(*size, *shape, dtype=dtype, device=self.lanes.device)
 
+        stored = {name: zeros(*shape, dtype=dtype) for name, (shape, dtype) in form.fields.items()}
         members = form.action_shape
         actions = self.lanes.spaces.actions
         entries = {
-            "observation": zeros(*form.observation_shape, dtype=form.dtype),
-            "action": zeros(*members, dtype=torch.int64),
+            "observation": stored["observation"],
+            "action": stored["action"],
             "action_log_prob": zeros(*members),
             **{name: zeros(*members, 1) for name in ("advantage", "value_target", "state_value")},
         }
         if self._reads_logits:
             entries["logits"] = zeros(*members, actions)
         if form.has_in_play:
-            entries["in_play"] = ~zeros(*members, dtype=torch.bool)
+            entries["in_play"] = ~stored["in_play"]
         if self.states is not None:
             entries |= {name: zeros(*shape) for name, shape in self.states.shapes.items()}
             entries["is_init"] = zeros(dtype=torch.bool)
@@ -424,19 +425,9 @@ class Rollout:
         self._lanes = lanes
         rollout_axis = () if rollouts is None else (rollouts,)
         axes = (*rollout_axis, len(lanes), lanes.worlds, steps)
-        shapes: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-            "observation": (form.observation_shape, form.dtype),
-            "action": (form.action_shape, torch.int64),
-            "next_observation": (form.observation_shape, form.dtype),
-            "reward": (form.reward_shape, torch.float32),
-            "done": ((), torch.bool),
-            "terminated": ((), torch.bool),
-        }
-        if form.has_in_play:
-            shapes["in_play"] = (form.action_shape, torch.bool)
         self.fields = {
             name: torch.zeros((*axes, *shape), dtype=dtype, device=lanes.device)
-            for name, (shape, dtype) in shapes.items()
+            for name, (shape, dtype) in form.fields.items()
         }
         """The stored turns, [L, W, T, ...], or [P, L, W, T, ...]."""
         self.steps = steps

@@ -29,7 +29,6 @@ from cprl.commons.spaces import Spaces
 from cprl.keys import Turn
 from cprl.learners.lanes import Lanes
 from cprl.learners.settings import TabularSettings
-from cprl.learners.transitions import lane_turn
 from cprl.objectives.rewards import RewardModel
 from cprl.policies.actors import LaneActor
 from cprl.policies.rng import Purpose
@@ -66,6 +65,7 @@ class TabularLearner:
                 self.tables.add_lane(lane, start["states"].numpy(), start["values"].numpy())
         self.actor = self._actor(Purpose.EXPLORATION, worlds=self.worlds)
         self.actor.epsilon = settings.epsilon(0)
+        self._form = lanes.form()
         self._columns = lanes.columns.T.numpy()
         """The columns of a `LaneTurn` that hold the lanes of each world of the replicas, int64 [W, L]."""
         lane_by_column = np.empty(self._columns.size, np.int64)
@@ -103,7 +103,7 @@ class TabularLearner:
             turn = Turn.of(turn.batch.cpu())
         rewards = turn.next_agents["reward"][..., 0]
         shaped = self.rewards.add(rewards, turn.next_world[keys.DONE][..., 0])
-        transitions = lane_turn(self.agents, turn, shaped)
+        transitions = self.lanes.turn(turn, shaped, self._form)
         rows = self.tables.find_or_add(states_of(transitions.observation), self._lane_by_column)
         next_states = states_of(transitions.next_observation)
         next_rows = np.full(len(rows), NEVER_MET, np.int64)  # terminal states have the value 0
