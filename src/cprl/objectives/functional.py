@@ -53,20 +53,18 @@ class FunctionalLoss:
         refuse_updaters(loss, _NO_UPDATER.format(type(loss).__name__))
         self.module = loss
 
-    def __call__(self, params: Weights, targets: Weights, batch: TensorDict) -> Tensor:
+    def __call__(self, weights: Weights, batch: TensorDict) -> Tensor:
         """Return the loss of each transition, [L, b], or [b] under vmap; one number if the loss averages it.
 
         Args:
-            params: the weights that are trained, named as by `named_weights`.
-            targets: the other weights.
+            weights: all weights of the loss, named as by `named_weights`.
         """
-        weights = {**params, **targets}
         for name, size in self._groups.items():
             prefix = f"{name}:"
             group = {key.removeprefix(prefix): weights[key] for key in weights if key.startswith(prefix)}
             setattr(self.module, name, TensorDict(group, size).unflatten_keys("."))
         for name in self._single_names:
-            setattr(self.module, name, params[name])
+            setattr(self.module, name, weights[name])
         if not torch.compiler.is_compiling():
             forget_cached_weights(self.module)
         losses = total(self.module(batch), self.module)
