@@ -8,7 +8,7 @@ from collections.abc import Callable
 from io import BytesIO
 from pickle import Pickler
 from types import FunctionType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import torch
 from tensordict import is_tensor_collection
@@ -16,38 +16,10 @@ from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from cprl.objectives.functional import named_weights
+from cprl.objectives.functional import STATE_TYPES, named_weights
 
 _CHANGED_BY_TORCH: Final = frozenset({*vars(nn.Module()), "_cache"})
 """Attributes of modules that torch and TorchRL themselves change in a call."""
-_NUMBERS: Final = bool | int | float
-"""The types of plain numbers."""
-
-
-class _Entry(NamedTuple):
-    """A buffer or an attribute of a loss, with its content at the time it was read."""
-
-    value: Any
-    """The object itself, which later calls may change."""
-    is_buffer: bool
-    content: bytes
-    """What the object holds, see `_content`."""
-
-    def can_become(self, after: "_Entry") -> bool:
-        """Return whether a learner can store the change from this entry to another, for each lane."""
-        value = after.value
-        if (
-            self.is_buffer
-            and after.is_buffer
-            and isinstance(value, Tensor)
-            and isinstance(self.value, Tensor)
-        ):
-            return self.value.shape == value.shape and self.value.dtype == value.dtype
-        return isinstance(value, _NUMBERS | Tensor) and not after.is_buffer
-
-
-_NO_ENTRY: Final = _Entry(None, False, b"")
-"""In place of an entry that does not exist before or after a call."""
 
 
 def changed_state(loss: LossModule, call: Callable[[], Any]) -> list[str]:
@@ -65,46 +37,60 @@ def changed_state(loss: LossModule, call: Callable[[], Any]) -> list[str]:
     Raises:
         ValueError: if anything else changes, or a buffer is new or changes its size.
     """
-    state = _state_of(loss)
+    sizes = _buffer_sizes(loss)
+    contents = _contents(loss)
     changed = set()
     for _ in range(2):
-        state_before = state
+        contents_before = contents
         call()
-        state = _state_of(loss)
-        for name in sorted(state_before.keys() | state.keys()):
-            before = state_before.get(name, _NO_ENTRY)
-            after = state.get(name, _NO_ENTRY)
-            if before.content == after.content:
-                continue
-            is_of_submodule = "." in name
-            if (is_of_submodule and not after.is_buffer) or not before.can_become(after):
-                kind = "buffer that comes or grows" if after.is_buffer else type(after.value).__name__
-                raise ValueError(
-                    f"the loss {type(loss).__name__} keeps its {name}, a {kind}, from call to call, which no "
-                    "checkpoint has; allowed: buffers of one size, and attributes of the loss itself that "
-                    "are numbers or tensors"
-                )
-            changed.add(name)
+        contents = _contents(loss)
+        names = contents_before.keys() | contents.keys()
+        changed |= {name for name in names if contents_before.get(name) != contents.get(name)}
+    new_sizes = _buffer_sizes(loss)
+    for name in sorted(changed):
+        if name in new_sizes:
+            kind = "buffer that comes or grows"
+            is_stored = sizes.get(name) == new_sizes[name]
+        else:
+            value = _state_of(loss).get(name)
+            kind = type(value).__name__
+            is_stored = "." not in name and isinstance(value, STATE_TYPES)
+        if not is_stored:
+            raise ValueError(
+                f"the loss {type(loss).__name__} keeps its {name}, a {kind}, from call to call, which no "
+                "checkpoint has; allowed: buffers of one size, and attributes of the loss itself that "
+                "are numbers or tensors"
+            )
     return sorted(changed)
 
 
-def _state_of(loss: LossModule) -> dict[str, _Entry]:
+def _buffer_sizes(loss: LossModule) -> dict[str, tuple[torch.Size, torch.dtype]]:
+    """Return the shape and the dtype of each buffer of a loss and its submodules, by name."""
+    buffers = loss.named_buffers(remove_duplicate=False)
+    return {name: (buffer.shape, buffer.dtype) for name, buffer in buffers}
+
+
+def _state_of(loss: LossModule) -> dict[str, Any]:
     """Return the buffers and attributes of a loss and its submodules, by name."""
     modules = dict(loss.named_modules())
-    # Each module is compared under its own name, and not wherever an attribute refers to it.
-    module_ids = {id(module) for module in modules.values()}
-    weights = {value.data_ptr() for value in named_weights(loss).values()}
-    state = {}
     groups = tuple(f"{path}." for path, module in modules.items() if isinstance(module, TensorDictParams))
+    state = {}
     for path, module in modules.items():
         if f"{path}.".startswith(groups):
             continue  # weights
         attributes = {name: value for name, value in vars(module).items() if name not in _CHANGED_BY_TORCH}
         buffers = dict(module.named_buffers(recurse=False, remove_duplicate=False))
         for name, value in {**attributes, **buffers}.items():
-            content = _content(value, module_ids, weights)
-            state[f"{path}.{name}".removeprefix(".")] = _Entry(value, name in buffers, content)
+            state[f"{path}.{name}".removeprefix(".")] = value
     return state
+
+
+def _contents(loss: LossModule) -> dict[str, bytes]:
+    """Return what the buffers and attributes of a loss and its submodules hold, by name, see `_content`."""
+    # Each module is compared under its own name, and not wherever an attribute refers to it.
+    module_ids = {id(module) for module in loss.modules()}
+    weights = {value.data_ptr() for value in named_weights(loss).values()}
+    return {name: _content(value, module_ids, weights) for name, value in _state_of(loss).items()}
 
 
 def _content(value: Any, module_ids: set[int], weights: set[int]) -> bytes:

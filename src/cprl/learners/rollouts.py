@@ -39,16 +39,15 @@ def state_shapes(network: nn.Module) -> dict[str, tuple[int, ...]]:
     Raises:
         ValueError: if only one of them is recurrent.
     """
-    parts = list(networks_by_name(network).items())[:2]
-    shapes = [state_shape_of(part) for _, part in parts]
-    if all(shape is None for shape in shapes):
-        return {}
-    for (name, _), shape in zip(parts, shapes, strict=True):
-        if shape is None:
-            raise ValueError(
-                f'the "{name}" is not recurrent; allowed beside a network that is: a GRU or an LSTM'
-            )
-    return {name: shape for name, shape in zip(STATE_NAMES, shapes, strict=True) if shape is not None}
+    shapes: dict[str, Any] = {}
+    for name in ("actor", "critic"):
+        shapes[name] = state_shape_of(networks_by_name(network)[name])
+    stateless = [name for name, shape in shapes.items() if shape is None]
+    if len(stateless) == 1:
+        raise ValueError(
+            f'the "{stateless[0]}" is not recurrent; allowed beside a network that is: a GRU or an LSTM'
+        )
+    return {} if stateless else dict(zip(STATE_NAMES, shapes.values(), strict=True))
 
 
 class States:

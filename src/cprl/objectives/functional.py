@@ -27,7 +27,7 @@ _NO_UPDATER: Final = (
 )
 
 
-_STATE_TYPES: Final = bool | int | float | Tensor
+STATE_TYPES: Final = bool | int | float | Tensor
 """The types of attributes of a loss that count as its state."""
 
 
@@ -94,7 +94,7 @@ def make_lazy_parts(loss: LossModule) -> None:
 
 def attributes_of(loss: LossModule) -> dict[str, Any]:
     """Return the attributes of a loss that are numbers or tensors, which it may change from call to call."""
-    return {name: value for name, value in vars(loss).items() if isinstance(value, _STATE_TYPES)}
+    return {name: value for name, value in vars(loss).items() if isinstance(value, STATE_TYPES)}
 
 
 def set_attributes(loss: LossModule, attributes: Mapping[str, Any]) -> None:
