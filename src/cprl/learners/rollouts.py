@@ -205,30 +205,22 @@ class Rollouts:
     def example(self, lanes: int) -> TensorDict:
         """Return a synthetic minibatch of a number of lanes, in the shapes of those that `due` yields."""
         settings = self.settings
-        form = self.form
         steps = min(settings.minibatch_size, settings.rollout_steps * self.lanes.worlds)
-        size = [lanes, steps if self.states is None else self.sequence_steps]
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(*size, *shape, dtype=dtype, device=self.lanes.device)
-
-        stored = {name: zeros(*shape, dtype=dtype) for name, (shape, dtype) in form.fields.items()}
-        members = form.action_shape
+        size = lanes, 1, steps if self.states is None else self.sequence_steps
+        device = self.lanes.device
         actions = self.lanes.spaces.actions
-        entries = {
-            "observation": stored["observation"],
-            "action": stored["action"],
-            "action_log_prob": zeros(*members),
-            **{name: zeros(*members, 1) for name in ("advantage", "value_target", "state_value")},
+        columns = {
+            name: torch.zeros(*size, *shape, dtype=dtype, device=device)
+            for name, (shape, dtype) in self.form.fields.items()
         }
-        if self._reads_logits:
-            entries["logits"] = zeros(*members, actions)
-        if form.has_in_play:
-            entries["in_play"] = ~stored["in_play"]
+        logits = torch.zeros(*size, *self.form.action_shape, actions, device=device)
+        value = logits[..., :1]
+        states: dict[str, Tensor] = {}
         if self.states is not None:
-            entries |= {name: zeros(*shape) for name, shape in self.states.shapes.items()}
-            entries["is_init"] = zeros(dtype=torch.bool)
-        return randomized(TensorDict(entries, size), actions)
+            for name, shape in self.states.shapes.items():
+                states[name] = torch.zeros(*size, *shape, device=device)
+            states["is_init"] = torch.zeros(size, dtype=torch.bool, device=device)
+        return randomized(self._entries(columns, logits, value, value, states), actions)
 
     def _minibatches(self, numbers: Tensor) -> Tensor:
         """Return the steps of each minibatch of an epoch.
@@ -250,22 +242,39 @@ class Rollouts:
 
     @torch.no_grad()
     def _batch(self, networks: LaneNetworks) -> TensorDict:
-        """Return the rollout with advantages, [L, W x T], under the keys of TorchRL's losses.
+        """Return the rollout with advantages, [L, W x T], under the keys of TorchRL's losses."""
+        columns = self.rollout.fields
+        if self.states is not None:
+            return self._entries(columns, *self.states.evaluate(networks, columns))
+        return self._entries(columns, *self._evaluate(networks), {})
+
+    def _entries(
+        self,
+        columns: Mapping[str, Tensor],
+        logits: Tensor,
+        value: Tensor,
+        next_value: Tensor,
+        states: Mapping[str, Tensor],
+    ) -> TensorDict:
+        """Return rollouts with what actor and critic say of them, [L, W, T, ...], as one batch of steps, [L,
+        W x T].
 
         If the settings say so, advantages are normalised within each lane.
+
+        Args:
+            columns: the fields of the rollouts.
+            logits: the outputs of the actor.
+            value: the values of the states before each step.
+            next_value: the values of the states after each step.
+            states: the entries that losses of recurrent networks read besides.
         """
-        columns = self.rollout.fields
-        entries: dict[str, Tensor] = {}
-        if self.states is not None:
-            logits, value, next_value, entries = self.states.evaluate(networks, columns)
-        else:
-            logits, value, next_value = self._evaluate(networks)
         all_but_lanes = tuple(range(1, value.ndim))
         advantage, target = advantages(
             columns, value, next_value, settings=self.settings, over=all_but_lanes, time_dim=2
         )
         log_probs = logits.log_softmax(-1).gather(-1, columns["action"].unsqueeze(-1)).squeeze(-1)
-        entries |= {
+        entries = {
+            **states,
             "observation": columns["observation"],
             "action": columns["action"],
             "action_log_prob": log_probs,
@@ -277,8 +286,10 @@ class Rollouts:
             entries["logits"] = logits
         if self.form.has_in_play:
             entries["in_play"] = columns["in_play"]
-        size = [len(self.lanes), self.lanes.worlds * self.settings.rollout_steps]
-        return TensorDict({name: entry.flatten(1, 2) for name, entry in entries.items()}, size)
+        lanes, worlds, steps = columns["done"].shape
+        return TensorDict(
+            {name: entry.flatten(1, 2) for name, entry in entries.items()}, [lanes, worlds * steps]
+        )
 
     def _evaluate(self, networks: LaneNetworks) -> tuple[Tensor, Tensor, Tensor]:
         """Return the logits, values and next values of a full rollout, [L, W, T, ...]."""
