@@ -226,7 +226,7 @@ class Algorithm(Value, stored=False):
             update=update,
             target_networks=targets,
             sharing=lanes.sharing,
-            compile=engine == "compiled" and memory.sequence_steps <= COMPILED_STEPS,
+            compile=engine == "compiled" and memory.form.sequence_steps <= COMPILED_STEPS,
         )
 
     def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> AnyLearner:

@@ -41,9 +41,7 @@ class Memory(Protocol):
     """The memory of lanes: it stores every turn, and yields batches when an update is due."""
 
     form: TransitionForm
-    """The shapes of what it stores of a turn."""
-    sequence_steps: int
-    """The consecutive turns in each sample; 1 if samples are single transitions."""
+    """The shapes of what it stores of a turn, and of what it samples."""
 
     def write(self, turn: Turn, lane_turn: LaneTurn) -> None:
         """Store a turn.

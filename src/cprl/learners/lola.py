@@ -202,8 +202,6 @@ class LOLARollouts:
         rollouts: the number of rollouts P.
     """
 
-    sequence_steps: Final = 1
-
     def __init__(self, lanes: Lanes, settings: LOLASettings, network: nn.Module, *, rollouts: int) -> None:
         refuse_other_networks(network)
         self.lanes = lanes

@@ -25,8 +25,6 @@ from cprl.learners.transitions import Horizon, LaneTurn, Sizes, TransitionForm, 
 from cprl.policies.rng import DRAWN_AHEAD, LaneRng
 from cprl.system.memory import check_memory, free_bytes
 
-_FIELDS: Final = ("observation", "action", "reward", "done", "terminated", "row")
-"""The names of the fields of every ring, in the order in which it holds them."""
 _STATE: Final = recurrent_state.AFTER
 """The name of the field with recurrent states, which a ring for sequences has besides."""
 _ROW_FIELDS: Final = ("observation", _STATE)
@@ -99,20 +97,26 @@ def _select_rows(field: Tensor, column: Tensor, row: Tensor, rows: int) -> Tenso
 
 
 class _Gather(NamedTuple):
-    """A function that gathers the transitions of a `Draw`: `gather` with what does not change filled in."""
+    """A function that gathers the batch of a `Draw`: `gather`, or `sequences`, with what does not change
+    filled in."""
 
+    names: tuple[str, ...]
+    """The names of the fields of the ring, in the order in which it holds them."""
     rows: int
     horizon: Horizon | None
+    sequence_steps: int
 
     def __call__(self, columns: Sequence[Tensor]) -> TensorDict:
-        """Return the transitions, [L, b].
+        """Return the transitions, [L, b], or the sequences that begin with them, [L, b, T].
 
         Args:
-            columns: the fields of the ring in the order of `_FIELDS`, then the places of the transitions,
-                their columns, and, for losses that sample, uniform numbers.
+            columns: the fields of the ring, then the places of the transitions, their columns, and, for
+                losses that sample, uniform numbers.
         """
-        index, column, *noise = columns[len(_FIELDS) :]
-        fields = dict(zip(_FIELDS, columns, strict=False))
+        fields = dict(zip(self.names, columns, strict=False))
+        index, column, *noise = columns[len(fields) :]
+        if self.sequence_steps > 1:
+            return sequences(fields, index, column, self.rows, self.sequence_steps)
         return gather(fields, index, column, self.rows, self.horizon, *noise)
 
 
@@ -269,8 +273,6 @@ class Ring:
         noise_seeds: Sequence[Sequence[int]] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        self.horizon = form.horizon
-        self.sequence_steps = form.sequence_steps
         self.device = torch.device(device)
         columns = torch.arange(len(seeds))[:, None] if columns is None else columns
         self.columns = columns.to(self.device)
@@ -291,6 +293,7 @@ class Ring:
         "row", [T, C], counts the rows that a column has written; the observation before a turn has this row,
         that after it the next one. A recurrent state, [C x rows, K], has the row of the observation before
         the turn in which the agent acted with it."""
+        self._gather = _Gather(tuple(sizes), self.rows, form.horizon, form.sequence_steps)
         self._row_fields = [name for name in self.fields if name in _ROW_FIELDS]
         # Turns are written with numpy on the CPU: for so few numbers torch takes five times as long.
         self._arrays = {name: array_of(field) for name, field in self.fields.items()}
@@ -393,26 +396,20 @@ class Ring:
             column: their columns, int64 [L, b] or [L, 1]; by default those of each lane's first world.
         """
         column = self.columns[:, :1] if column is None else column
-        if self.sequence_steps > 1:
-            return sequences(self.fields, index, column, self.rows, self.sequence_steps)
-        return gather(self.fields, index, column, self.rows, self.horizon)
+        return self._gather([*self.fields.values(), index, column])
 
     def sample(self) -> TensorDict:
         """Return the next sample: transitions [L, b], or sequences [L, b, T]; with the entry "noise" for
         losses that sample."""
-        batch = self.get(*self.places())
-        if self.noise is not None:
-            batch.set("noise", self.noise.next())
-        return batch
+        draw = self.draw()
+        return draw.gather(draw.columns)
 
     def draw(self) -> Draw:
-        """Return the next sample as a `Draw`: the update gathers it itself, unless it has sequences."""
-        if self.sequence_steps > 1:
-            return Draw.of(self.sample())
+        """Return the next sample as a `Draw`, which the update gathers itself."""
         index, column = self.places()
         noise = [] if self.noise is None else [self.noise.next()]
         columns = [*self.fields.values(), index, column, *noise]
-        return Draw(_Gather(self.rows, self.horizon), columns, (self.sizes, index.shape))
+        return Draw(self._gather, columns, (self.sizes, index.shape))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the written part of all fields, and the states of the random generators.

@@ -176,10 +176,11 @@ class Rollouts:
         self._reads_logits = reads(loss, "logits")
         shapes = state_shapes(network)
         turns = min(settings.minibatch_size, settings.rollout_steps)
-        self.sequence_steps = turns if shapes else 1
-        """The consecutive turns T' of each sequence; 1 if no network is recurrent."""
-        cells = shapes[STATE_NAMES[ACTOR]][-1] if shapes else 0
-        self.form = lanes.form(state_cells=cells, has_in_play=settings.only_in_play)
+        self.form = lanes.form(
+            state_cells=shapes[STATE_NAMES[ACTOR]][-1] if shapes else 0,
+            sequence_steps=turns if shapes else 1,
+            has_in_play=settings.only_in_play,
+        )
         self.states = States(shapes, lanes, sequence_steps=turns) if shapes else None
         self.rollout = Rollout(lanes, settings.rollout_steps, self.form)
         steps = settings.rollout_steps * lanes.worlds
@@ -206,7 +207,7 @@ class Rollouts:
         """Return a synthetic minibatch of a number of lanes, in the shapes of those that `due` yields."""
         settings = self.settings
         steps = min(settings.minibatch_size, settings.rollout_steps * self.lanes.worlds)
-        size = lanes, 1, steps if self.states is None else self.sequence_steps
+        size = lanes, 1, steps if self.states is None else self.form.sequence_steps
         device = self.lanes.device
         actions = self.lanes.spaces.actions
         columns = {
@@ -233,7 +234,7 @@ class Rollouts:
             [minibatches, L, sequences, T'] if a minibatch has several sequences of each lane.
         """
         size = self.settings.minibatch_size
-        turns = self.sequence_steps
+        turns = self.form.sequence_steps
         if self.states is None:
             return numbers.argsort(-1).view(len(numbers), -1, size).transpose(0, 1)
         sequences = numbers[:, ::turns].argsort(-1).view(len(numbers), -1, size // turns).transpose(0, 1)
