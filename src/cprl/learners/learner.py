@@ -143,9 +143,9 @@ class Learner:
         """
         episodes_before = self._episodes
         self._episodes = episodes_before + ended.view(self.replicas, self.worlds).sum(1)
-        rule = self.lane_networks.rule
-        period = getattr(self.settings, "target_every_episodes", None)
-        if period is None or rule.tau is not None or rule.target_every_updates is not None:
+        settings = self.settings
+        period = getattr(settings, "target_every_episodes", None)
+        if period is None or settings.tau is not None or settings.target_every_updates is not None:
             return
         is_due = self._episodes // period > episodes_before // period
         if is_due.any():
@@ -172,7 +172,7 @@ class Learner:
         schedule = getattr(self.settings, "epsilon", None)
         epsilon = 0.0 if schedule is None else schedule(self.steps)  # stochastic policies have no epsilon
         self.actor.explore_with(epsilon)
-        if self.lane_networks.rule.decays:
+        if getattr(self.settings, "learning_rate_end", None) is not None:
             self.lane_networks.learning_rate = self.settings.learning_rate_at(self.steps)
         if getattr(self.algorithm, "entropy_coeff_end", None) is not None:
             self.lane_networks.set_entropy_coeff(self.algorithm.entropy_coeff_at(self.steps))
