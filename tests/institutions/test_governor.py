@@ -188,7 +188,7 @@ def test_what_a_governor_wants_of_a_period_of_two_turns(objective, wanted):
 
 def test_an_episode_has_the_mean_of_what_was_in_force_and_the_objective_of_the_whole():
     play = Play(ROW, institutions=[LOST, Governor(sets="tax.rate", every_steps=2, least_stock=0.4)])
-    assert metrics_for((*OPTIONAL_ENTRIES, *INSTITUTION_ENTRIES), play.game.institutions)[-2:] == (
+    assert metrics_for((*OPTIONAL_ENTRIES, *INSTITUTION_ENTRIES), play.game)[-2:] == (
         "governor/rule",
         "governor/objective",
     )

@@ -86,8 +86,7 @@ def _is_summarised(name: str) -> bool:
     metric = METRICS.get(name)
     if metric is None:
         return not name.endswith("/return")
-    is_total_gain = name in (COLLECTIVE_RETURN, INCOME)
-    return is_total_gain or metric.is_summarised or metric.is_of_institutions
+    return metric.is_summarised or metric.is_of_institutions
 
 
 def rewards_of(table: pa.Table) -> str:
