@@ -160,9 +160,7 @@ def by_factor(
                 axes.set_ylim(0, None)
             _scale(axes, layout.places, _replicas_by_level(table, factor), is_even=layout.is_even)
             axes.set_title(metric_title(metric, means))
-        for axes in panels[-columns:]:
-            axes.tick_params(labelbottom=True)
-            axes.set_xlabel(factor_word(factor) + ", at equal distances" * layout.is_even)
+        sheet.xlabel = factor_word(factor) + ", at equal distances" * layout.is_even
         sheet.title = f"{design.name}: outcome by {factor_word(factor)}"
         sheet.caption = figure_caption(table, f"{_levels_note(table)} Faint: single replicas.")
         if layout.others and list(layout.lines) == [""]:
@@ -437,9 +435,7 @@ def courses(
             windows |= _draw_courses(axes, table, content.metric, content.lines, is_dashed=is_dashed)
             _draw_random_lines(axes, _random_play(table, content.metric), content.lines)
             axes.set_title(content.title)
-        for axes in panels[-columns:]:
-            axes.tick_params(labelbottom=True)
-            axes.set_xlabel("episode")
+        sheet.xlabel = "episode"
         for group in [[axes] for axes in panels] if is_together else [panels]:
             if all(axes.dataLim.y0 >= 0 for axes in group):
                 group[0].set_ylim(0, None)

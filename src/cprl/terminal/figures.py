@@ -87,7 +87,7 @@ def training_curve(
             axes.set(xlim=(-0.5, max(length - 0.5, 1)), ylabel=with_unit(metric))
             if values.min() >= 0:
                 axes.set_ylim(0, None)
-        panels[-1].set_xlabel("episode")
+        sheet.xlabel = "episode"
         sheet.title = title.encode("utf-8", "replace").decode()
         sheet.caption = _caption(averaged_episodes, lanes)
         if exploration_turns is not None:

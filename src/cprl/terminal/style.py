@@ -109,11 +109,15 @@ class Sheet:
         self.caption = ""
         """The small text below the figure, which says how it was made."""
         self.legend_title = ""
+        self.xlabel = ""
+        """The label below the lowest panel of each column."""
         self._middle: Any = self.figure.subfigures()
         """The panels and their legend, between title and caption."""
         self._panel_wide_em = 0.0
         self._row_heights_em: dict[Axes, float] = {}
         """The height of each panel's row."""
+        self._lowest: list[Axes] = []
+        """The lowest panel of each column."""
         self._panels_high_em = 0.0
         """The height of all rows of panels together."""
 
@@ -148,7 +152,9 @@ class Sheet:
         for index, axes in enumerate(panels):
             self._row_heights_em[axes] = heights[index // columns]
             axes.set_visible(index < number)
-        return panels[:number]
+        panels = panels[:number]
+        self._lowest = panels[-columns:]
+        return panels
 
     def finish(self) -> None:
         """Add title, legend and caption, and make the figure as high as all its parts need."""
@@ -173,7 +179,10 @@ class Sheet:
         self._scale_lines()
 
     def _wrap_labels(self) -> None:
-        """Wrap the titles and the axis labels of all panels."""
+        """Wrap the titles and the axis labels of all panels, with the label that they share."""
+        for axes in self._lowest if self.xlabel else ():
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel(self.xlabel)
         for axes in self.figure.axes:
             row_height_em = self._row_heights_em.get(axes, self._panels_high_em)
             axes.set_title(wrapped(axes.get_title("left"), self._panel_wide_em - 1))

@@ -331,13 +331,7 @@ def _places(world: Int64, window: int) -> Int64:
     return np.asarray(after.max() - after)
 
 
-_SCHEMA: Final = pa.schema(
-    [
-        *((name, pa.string()) for name in ("condition", "checksum", "run", "part", "metric")),
-        *((name, pa.int32()) for name in ("replica", "episode", WINDOWS, "undefined")),
-        ("value", pa.float64()),
-    ]
-)
+_SCHEMA: Final = pa.schema([(name, dtype) for name, dtype in TABLE_COLUMNS.items() if name != "marks"])
 """The columns of the windows of a run."""
 
 
@@ -354,15 +348,13 @@ def _rows(design: StudyDesign, rows: pa.Table, marked: Mapping[str, str]) -> pa.
     rows = rows.filter(pc.is_valid(rows["#metric"]))
     keys = ("#condition", "replica", "#part", "#metric", "episode")
     rows = rows.sort_by([(name, "ascending") for name in keys])
-    columns = {name: rows[name] for name in TABLE_COLUMNS if name != "marks"}
-    for factor in design.factors:
-        column = f"factor {factor}" if factor in TABLE_COLUMNS else factor
-        columns[column] = _levels(design.levels(factor)).take(rows["#condition"])
     places = pc.index_in(rows["run"], pa.array(list(marked), pa.string()))
-    columns["marks"] = pa.array(list(marked.values()), pa.string()).take(places)
-    names = list(columns)
-    factors = names[len(TABLE_COLUMNS) - 1 : -1]
-    return pa.table(columns).select([*TABLE_COLUMNS[:2], *factors, *TABLE_COLUMNS[2:]])
+    marks = pa.array(list(marked.values()), pa.string()).take(places)
+    table = rows.append_column("marks", marks).select(list(TABLE_COLUMNS))
+    for position, factor in enumerate(design.factors, start=2):  # after the condition and its checksum
+        column = f"factor {factor}" if factor in TABLE_COLUMNS else factor
+        table = table.add_column(position, column, _levels(design.levels(factor)).take(rows["#condition"]))
+    return table
 
 
 def _metrics(names: Sequence[str]) -> list[str]:

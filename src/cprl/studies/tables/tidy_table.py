@@ -50,20 +50,20 @@ RANDOM_PART: Final = "random"
 RUN_PARTS: Final = {TRAINING_PART: None, EVALUATION_PART: "trained", RANDOM_PART: "random"}
 """The parts of a run: the training, the evaluation of its agents in fresh worlds, and random play in the same
 worlds; with the name of the evaluation's file."""
-TABLE_COLUMNS: Final = (
-    "condition",
-    "checksum",
-    "run",
-    "marks",
-    "replica",
-    "part",
-    "metric",
-    "episode",
-    "window_episodes",
-    "undefined",
-    "value",
-)
-"""The columns of a table without those of the factors, which follow "checksum"."""
+TABLE_COLUMNS: Final = {
+    "condition": pa.string(),
+    "checksum": pa.string(),
+    "run": pa.string(),
+    "marks": pa.string(),
+    "replica": pa.int32(),
+    "part": pa.string(),
+    "metric": pa.string(),
+    "episode": pa.int32(),
+    WINDOWS: pa.int32(),
+    "undefined": pa.int32(),
+    "value": pa.float64(),
+}
+"""The types of a table's columns without those of the factors, which follow "checksum"."""
 
 Circumstances = Mapping[str, str]
 """How a run was made: the version of each package, the checksum of each module of the user's own, the git
