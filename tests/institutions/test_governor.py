@@ -192,7 +192,7 @@ def test_an_episode_has_the_mean_of_what_was_in_force_and_the_objective_of_the_w
         "governor/rule",
         "governor/objective",
     )
-    totals = {"rules": np.array([[1.5]]), "steps": np.array([4]), "wanted": partial(welfare, play.game)}
+    totals = {"rules": np.array([[1.5]]), "steps": np.array([4]), "objective": partial(welfare, play.game)}
     paid = {"harvest": [[3.0, 1.0]], "fines": [[0.5, 0.5]], "transfers": [[0.0, 0.0]], "stock_left": [2]}
     found = compute_metrics(totals | {name: np.array(values) for name, values in paid.items()})
     assert found["governor/rule"].tolist() == [0.375]

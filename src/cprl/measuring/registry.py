@@ -469,14 +469,14 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
         name="governor/rule",
         words="mean of what the governor sets",
         unit="rate, share or level",
-        formula=lambda rules, steps, wanted: share_of(rules[..., -1], steps),
+        formula=lambda rules, steps, objective: share_of(rules[..., -1], steps),
         colour=PURPLE,
     ),
     Metric(
         name="governor/objective",
         words="objective of the governor",
         unit="a turn",
-        formula=lambda harvest, fines, transfers, steps, stock_left, wanted: wanted(
+        formula=lambda harvest, fines, transfers, steps, stock_left, objective: objective(
             incomes_of(harvest, fines, transfers), steps, stock_left
         ),
         colour=GREEN,
@@ -510,8 +510,8 @@ def constants_of(game: Game | None) -> dict[str, Any]:
     """Return what metrics need of a game beside the totals of its episodes, by the names of their parameters.
 
     "sustainable_yield", in apples per turn, and "first_stock" are given if the game's yield is proven;
-    "groups" with `Levies`, of which the first counts; "wanted", the objective as a function of incomes, turns
-    and the apples left, with a governor. For None, a game that is not of cprl, nothing is given.
+    "groups" with `Levies`, of which the first counts; "objective", a function of incomes, turns and the
+    apples left, with a governor. For None, a game that is not of cprl, nothing is given.
     """
     constants: dict[str, Any] = {}
     if game is None:
@@ -523,7 +523,7 @@ def constants_of(game: Game | None) -> dict[str, Any]:
     if levies:
         constants["groups"] = levies[0].groups
     if game.governor is not None:
-        constants["wanted"] = partial(welfare, game)
+        constants["objective"] = partial(welfare, game)
     return constants
 
 

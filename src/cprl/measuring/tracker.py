@@ -159,7 +159,11 @@ def custom_metric_name(metric: Custom) -> str:
 
 
 def check_custom_metrics(metrics: Sequence[Custom]) -> None:
-    """Refuse custom metrics with the name of another number of an episode."""
+    """Refuse custom metrics with the name of another number of an episode.
+
+    Raises:
+        ValueError: for a name that is taken or that no column can have; the message names the metric.
+    """
     names = [custom_metric_name(metric) for metric in metrics]
     for name, metric in zip(names, metrics, strict=True):
         if not name.isidentifier():

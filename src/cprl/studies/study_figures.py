@@ -25,7 +25,7 @@ from matplotlib.ticker import NullLocator
 from cprl.measuring.registry import COLLECTIVE_RETURN, bounds, title
 from cprl.measuring.statistics import Estimate, Family, curve_interval
 from cprl.measuring.table import WINDOWS, by_replica, where
-from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
+from cprl.measuring.windows import running_mean, smoothed_episodes
 from cprl.pictures.readable import capitalised
 from cprl.studies.tables.comparing import (
     INTERVALS,
@@ -85,7 +85,7 @@ def figures_of(
     if not table.metrics:
         return
     design = table.design
-    conditions = finished_conditions(table)
+    conditions = table.finished_conditions
     for factor in design.factors:
         if is_numeric([design.conditions[name][factor] for name in conditions]):
             draw = partial(by_factor, table, factor, metrics=metrics)
@@ -141,6 +141,9 @@ def by_factor(
         path: the file to draw.
         metrics: the metrics to draw; by default those that are compared.
         width: a "page" or a "column" of a paper.
+
+    Raises:
+        ValueError: for a factor without numeric levels, or a metric that the table does not have.
     """
     design = table.design
     numeric = [name for name in design.factors if is_numeric(design.levels(name))]
@@ -194,8 +197,8 @@ def _factor_layout(table: StudyTable, factor: str) -> _FactorLayout:
     shades: Sequence[Any] = range(len(lines))
     if len(others) == 1:
         shades = [design.conditions[names[0]][others[0]] for names in lines.values()]
-    levels = {name: design.conditions[name][factor] for name in finished_conditions(table)}
-    places, is_even = places_of(levels.values())
+    levels = {name: design.conditions[name][factor] for name in table.finished_conditions}
+    places, is_even = axis_places(levels.values())
     return _FactorLayout(
         lines=lines,
         colours=line_colours(list(lines), shades),
@@ -249,7 +252,7 @@ def _is_same_at_each_place(random_play: Mapping[str, float], at: Mapping[str, fl
     return all(map(are_one_number, by_place.values()))
 
 
-def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
+def axis_places(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
     """Return the place of each level on the axis, ordered, and whether the places are at equal distances."""
     ordered = sorted(set(levels))
     at = np.log(ordered) if is_logarithmic(ordered) else np.array(ordered, np.float64)
@@ -261,7 +264,7 @@ def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
 
 def _replicas_by_level(table: StudyTable, factor: str) -> Counter[float]:
     counts: Counter[float] = Counter()
-    for name in finished_conditions(table):
+    for name in table.finished_conditions:
         counts[table.design.conditions[name][factor]] += table.replicas[name]
     return counts
 
@@ -289,7 +292,7 @@ def _lines(table: StudyTable, factor: str, others: Sequence[str]) -> dict[str, l
     The conditions of a line are ordered by their level.
     """
     design = table.design
-    names = finished_conditions(table)
+    names = table.finished_conditions
     lines: dict[str, list[str]] = {}
     for name in names:  # lines are in the order of the conditions
         levels = design.conditions[name]
@@ -335,10 +338,14 @@ def by_condition(
         kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
         metrics: by default those that are compared, and of levels what institutions took and found.
         width: a "page" or a "column" of a paper.
+
+    Raises:
+        ValueError: for more than 60 conditions or none, a reference without a finished run, or a metric that
+            the table does not have.
     """
     design = table.design
     is_levels = kind == "levels"
-    conditions = [name for name in finished_conditions(table) if is_levels or name != design.reference]
+    conditions = [name for name in table.finished_conditions if is_levels or name != design.reference]
     if not is_levels and not table.replicas[design.reference]:
         raise ValueError(f"the reference {design.reference} has no finished run; allowed: one that has")
     if not 0 < len(conditions) <= _MOST_CONDITIONS:
@@ -399,8 +406,6 @@ def _draw_row(axes: Axes, place: int, one: Estimate | None, values: Mapping[int,
 
 _DEFAULT_COURSES: Final = (COLLECTIVE_RETURN, "survival_steps")
 """The metrics whose courses are drawn by default."""
-_SMOOTHED_SHARE: Final = 20
-"""A running mean covers at most 1/20 of a training, so that short trainings keep their course."""
 _MOST_TOGETHER: Final = 6
 """The largest number of conditions in one panel. With more, each has a panel, beside the reference."""
 
@@ -415,9 +420,12 @@ def courses(
 
     Args:
         metrics: by default the collective return and survival; else the first that the table has.
+
+    Raises:
+        ValueError: for more than 60 conditions, or a metric that the table does not have.
     """
     design = table.design
-    conditions = finished_conditions(table)
+    conditions = table.finished_conditions
     usual = [metric for metric in _DEFAULT_COURSES if metric in table.metrics]
     chosen = compared_metrics(table, metrics or usual)[: len(metrics) or 2]
     if len(conditions) > _MOST_CONDITIONS:
@@ -524,7 +532,7 @@ def _draw_courses(
         length = int(lengths.max())
         episodes = pc.min(by_replica(rows, metric)["episodes"]).as_py()
         is_whole = (lengths == length).all(0)  # those that all replicas have
-        count = max(1, min(SMOOTHED_EPISODES, episodes // _SMOOTHED_SHARE) // length)
+        count = max(1, smoothed_episodes(episodes) // length)
         at = running_mean(_windows_of(rows, "episode")[0, is_whole] + (length - 1) / 2, count)
         curve = curve_interval(running_mean(_windows_of(rows, "value")[:, is_whole], count))
         label = " ".join(label.splitlines())
@@ -547,14 +555,9 @@ def _windows_of(rows: pa.Table, number: str) -> Float64:
 # What all of them share
 
 
-def finished_conditions(table: StudyTable) -> list[str]:
-    """Return the conditions that have a finished run. Figures leave out the others."""
-    return [name for name in table.design.conditions if table.replicas[name]]
-
-
 def missing_note(table: StudyTable) -> str:
     """Return a sentence that counts the conditions without a finished run; "" if there are none."""
-    count = len(table.design.conditions) - len(finished_conditions(table))
+    count = len(table.design.conditions) - len(table.finished_conditions)
     return f" Not run: {count} of {len(table.design.conditions)} conditions." if count else ""
 
 

@@ -140,17 +140,14 @@ class Overview:
             note = reason or self._status[trial.name].failure()
             note = note or (REASONS["refused"] if state == "refused" else "")
             idle: TrialState = "waiting" if state == "missing" else "unfinished"
-            if note:
-                idle = "failed"
-            return TrialProgress(trial, idle, episodes, of, note=note)
+            return TrialProgress(trial, "failed" if note else idle, episodes, of, note=note)
         per_s = said.get("episodes_per_s") or 0.0
+        left = f"{format_duration((of - episodes) / per_s)} left" if per_s else ""
+        running = TrialProgress(trial, "running", episodes, of, per_s, left)
         if said.get("is_compiling"):
             note = f"for {format_duration(said.get('compiling_s', 0.0))}"
-            return TrialProgress(trial, "compiling", episodes, of, per_s, note)
-        if episodes == of:
-            return TrialProgress(trial, "evaluating", episodes, of, per_s)
-        note = f"{format_duration((of - episodes) / per_s)} left" if per_s else ""
-        return TrialProgress(trial, "running", episodes, of, per_s, note)
+            return running._replace(state="compiling", note=note)
+        return running._replace(state="evaluating", note="") if episodes == of else running
 
     def _listen(self, name: str) -> Mapping[str, Any]:
         """Read the status of a trial, and note the time if it has changed.

@@ -126,6 +126,9 @@ class Trial:
         """Refuse a directory that holds another run, e.g. one that was renamed or restored from a backup.
 
         A run that is not finished may be shorter than the trial: it is a copy that will be continued.
+
+        Raises:
+            ValueError: for another run; the message says how it differs.
         """
         run = self.directory
         stored = recipe_config(read_recipe(run))

@@ -17,10 +17,8 @@ from typing import Any, Final, Literal
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 
 from cprl.runs.files import refuse_to_write_over, write_atomically, write_text
 from cprl.terminal.text_tables import wrap_lines
@@ -254,6 +252,10 @@ def check_picture(path: str | Path, name: str = "path", *, is_new: bool = True) 
     Args:
         name: the name of the argument, for a refusal.
         is_new: whether to refuse a path that exists.
+
+    Raises:
+        ValueError: for another suffix than `PICTURE_SUFFIXES`.
+        FileExistsError: if the path exists and `is_new`.
     """
     path = Path(path)
     if path.suffix not in PICTURE_SUFFIXES:
@@ -304,11 +306,3 @@ def _with_colours(drawn: BytesIO, colours: int) -> BytesIO:
 def wrapped(text: str, wide: float, character: float = CHARACTER) -> str:
     """Break a text into lines of at most `wide` em, with characters of about `character` em."""
     return wrap_lines(text, max(4, int(wide / character)))
-
-
-def draw_cell(axes: Axes, x: int, y: int, colour: Any, text: str) -> None:
-    """Draw a cell of one unit around (x, y); its text is black on light colours and white on dark ones."""
-    red, green, blue, _ = to_rgba(colour)
-    ink = "black" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.5 else "white"
-    axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
-    axes.text(x, y, text, ha="center", va="center", color=ink)

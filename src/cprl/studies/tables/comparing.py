@@ -63,7 +63,7 @@ def condition_means(table: StudyTable, metrics: Sequence[str] = (), *, part: str
     chosen = compared_metrics(table, metrics, part=part)
     clocks = table.design.clocks
     means = estimates(table.windows(part), chosen, by="condition")
-    return means.changed(lambda key, one: one.of(key[1], clocks.get(key[0], inf)))
+    return means.changed(lambda key, one: one.bounded(key[1], clocks.get(key[0], inf)))
 
 
 def condition_differences(table: StudyTable, metrics: Sequence[str], *, part: str = TRAINING_PART) -> Family:
@@ -90,6 +90,9 @@ def compared_metrics(
 
     The default is all of `COMPARED_METRICS` and of the user's own metrics that the table has, without those
     that only repeat another one, see `duplicate_metrics`.
+
+    Raises:
+        ValueError: for a metric that the table does not have.
     """
     for metric in metrics:
         if metric not in table.metrics:

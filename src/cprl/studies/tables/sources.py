@@ -290,8 +290,8 @@ def _windows(table: pa.Table, source: RunSource, part: str, window: int) -> pa.T
     replica = one["replica"].to_numpy()
     size = window if part == TRAINING_PART or window == 1 else len(one)
     world = world_of(one)
-    places = [_places(world[replica == number], size) for number in np.unique(replica)]
-    place = np.concatenate(places)
+    windows = [_window_indices(world[replica == number], size) for number in np.unique(replica)]
+    place = np.concatenate(windows)
     group = replica * (place.max() + 1) + place
     order = np.argsort(group, kind="stable")
     begin = np.flatnonzero(np.diff(group[order], prepend=-1))
@@ -318,7 +318,7 @@ def _windows(table: pa.Table, source: RunSource, part: str, window: int) -> pa.T
     return pa.table({field.name: pa.array(columns[field.name], field.type) for field in _SCHEMA})
 
 
-def _places(world: Int64, window: int) -> Int64:
+def _window_indices(world: Int64, window: int) -> Int64:
     """Return the index of the window of each episode of a replica, int64 [E].
 
     Args:
