@@ -191,15 +191,8 @@ class Evaluations:
             env = make_worlds(experiment, len(group) * worlds, first=group[0] * worlds, fresh=True)
             load_transforms_state(env, transforms_state(self._env))
             stored = self._population.as_stored(group)
-            agents = self._population.spaces.agents
-            policies = stored_policies(
-                stored[:agents],
-                self._population.playing,
-                replicas=group,
-                worlds=worlds,
-                seed=seed,
-                governor=stored[agents] if len(stored) > agents else (),
-            )
+            playing = self._population.playing
+            policies = stored_policies(stored, playing, replicas=group, worlds=worlds, seed=seed)
             episodes = evaluate(env, policies, metrics=experiment.metrics)
             for index, replica in enumerate(group):
                 played[replica] = episodes[index * worlds : (index + 1) * worlds]
