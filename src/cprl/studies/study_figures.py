@@ -391,12 +391,12 @@ def by_condition(
     return Path(path)
 
 
-def _draw_row(axes: Axes, place: int, one: Estimate | None, values: Mapping[int, float]) -> None:
+def _draw_row(axes: Axes, place: int, estimate: Estimate | None, values: Mapping[int, float]) -> None:
     """Draw the value of a condition in a row, or a text that says why there is none."""
-    if one is not None and one.replicas:
-        draw_dots(axes, [place], [one], replicas=[list(values.values())], across=True)
+    if estimate is not None and estimate.replicas:
+        draw_dots(axes, [place], [estimate], replicas=[list(values.values())], across=True)
         return
-    why = "no pairs" if one is None else "undefined"
+    why = "no pairs" if estimate is None else "undefined"
     box = {"facecolor": "white", "edgecolor": "none", "pad": 1}
     across = axes.get_yaxis_transform()
     axes.text(0.5, place, why, bbox=box, ha="center", va="center", transform=across)
@@ -635,7 +635,7 @@ def _levels_note(table: StudyTable) -> str:
 def metric_title(metric: str, levels: Family) -> str:
     """Return the title of a metric, with the number of episodes in which it is undefined, if any."""
     means = levels.column(metric).values()
-    undefined = sum(one.undefined for one in means)
-    episodes = sum(one.episodes for one in means)
+    undefined = sum(mean.undefined for mean in means)
+    episodes = sum(mean.episodes for mean in means)
     name = title(metric)
     return f"{name}, undefined in {undefined:,} of {episodes:,} episodes" if undefined else name

@@ -240,7 +240,7 @@ def _answer_of(table: StudyTable) -> str:
             family = effects_of(table, metric, part=EVALUATION_PART)
             beside = "effects of each factor over all cells of the grid, paired by replica"
             tests = f"{family.tests} effects on a metric"
-        changes = {name: one for (name,), one in family.column(metric).items()}
+        changes = {name: change for (name,), change in family.column(metric).items()}
         parts += [f"- {subject}:", *_verdict_lines(changes, unit(metric))]
     what = f"In {episodes_text(table, EVALUATION_PART)}, {beside}"
     what += f"; by Holm's method for the {tests}:" if family.tests else ":"
@@ -253,18 +253,18 @@ def _verdict_lines(differences: Mapping[str, Estimate], unit_of: str) -> list[st
     For differences that are not shown, the line says how large they would have to be to show.
     """
     by_kind: dict[str, list[str]] = {kind: [] for kind in ("more", "less", _NONE, _ALONE, _UNTOLD)}
-    for name, one in differences.items():
-        text = f"{escape_cell(name)} {one:+}"
-        if one.differs:
-            kind = "more" if one.value > 0 else "less"
-        elif isnan(one.reach):
+    for name, change in differences.items():
+        text = f"{escape_cell(name)} {change:+}"
+        if change.differs:
+            kind = "more" if change.value > 0 else "less"
+        elif isnan(change.reach):
             kind = _UNTOLD
-        elif abs(one.value) > one.reach:
+        elif abs(change.value) > change.reach:
             kind = _ALONE
         else:
             kind = _NONE
-            size = f"{one.reach:{number_format(one.value, one.low, one.high)}} {unit_of}".rstrip()
-            text += f" (differences below {size} would not show)" if one.reach else ""
+            size = f"{change.reach:{number_format(change.value, change.low, change.high)}} {unit_of}".rstrip()
+            text += f" (differences below {size} would not show)" if change.reach else ""
         by_kind[kind].append(text)
     return [f"  - {kind}: {'; '.join(texts)}" for kind, texts in by_kind.items() if texts]
 

@@ -105,8 +105,8 @@ def _groups(
     for values, members in sorted(by_values.values(), key=lambda group: list(map(_rank, group[0]))):
         levels = {path: plain_level(value) for path, value in zip(fields, values, strict=True)}
         if _AGENTS in levels:
-            one: Any = next(iter(members.values()))
-            levels[_AGENTS] = learned(specs_by_agent(one.agents, one.game.agents))
+            first: Any = next(iter(members.values()))
+            levels[_AGENTS] = learned(specs_by_agent(first.agents, first.game.agents))
         name = unique_name(condition_name(levels), groups)
         conditions[name] = levels
         groups[name] = members
@@ -127,15 +127,15 @@ def _rank(value: Any) -> tuple[int, float]:
 
 def _refuse_seeds_twice(name: str, experiments: Experiments) -> None:
     """Refuse runs of one condition with the same seed, which would count replicas twice."""
-    for (one, first), (other, second) in combinations(experiments.items(), 2):
-        if first.seed == second.seed and not has_people(first.agents):
-            places = _differing_fields(first, second)
+    for (run, experiment), (other_run, other) in combinations(experiments.items(), 2):
+        if experiment.seed == other.seed and not has_people(experiment.agents):
+            places = _differing_fields(experiment, other)
             why = "they are the same experiment"
             if places:
                 why = f"they differ in {abbreviated(places, _MOST_NAMED)}"
             raise ValueError(
-                f"{one} and {other} have the same seed, {first.seed}, and both {name}, which would count "
-                f"replicas twice; {why}; allowed: each seed once in a condition, or another field in by"
+                f"{run} and {other_run} have the same seed, {experiment.seed}, and both {name}, which would "
+                f"count replicas twice; {why}; allowed: each seed once in a condition, or another field in by"
             )
 
 
@@ -179,10 +179,10 @@ def _absences(experiments: Experiments) -> Iterator[str]:
             yield f"{run}: {sentence}"
 
 
-def _differing_fields(one: Experiment, other: Experiment) -> list[str]:
+def _differing_fields(first: Experiment, second: Experiment) -> list[str]:
     """Return the paths in which two experiments differ, without fields that are part of no condition."""
-    before = one.to_config()
-    now = other.to_config()
+    before = first.to_config()
+    now = second.to_config()
     for name in _NOT_COMPARED:
         before[name] = now[name]
     lines = describe_changes(before, now, "")
