@@ -46,6 +46,7 @@ from cprl.terminal.style import (
     DASHES,
     MEAN,
     RANDOM_LINE,
+    Sheet,
     Width,
     drawing,
     wrapped,
@@ -355,31 +356,19 @@ def by_condition(
     levels = family if is_levels else condition_means(table, chosen)
     rows = table.windows()
     with drawing(path, width=width) as sheet:
-        wide = min(_NAME_WIDTH, 0.3 * sheet.width_em)
-        texts = condition_labels(table)
-        names = {name: wrapped(texts[name], wide) for name in conditions}
-        lines = [name.splitlines() for name in names.values()]
-        high = (_LINE_HEIGHT * max(map(len, lines)) + 0.8) * len(conditions) + 7
-        beside = CHARACTER * max(len(line) for name in lines for line in name)
-        columns = sheet.fitting(len(chosen), 12.5)
-        panels = sheet.panels(len(chosen), columns=columns, high=high, beside=beside, sharey=True)
+        labels = condition_labels(table)
+        panels = _row_panels(sheet, [labels[name] for name in conditions], len(chosen))
         for axes, metric in zip(panels, chosen, strict=True):
             values = values_of(rows, metric) if is_levels else {}
-            random_play = _random_play(table, metric) if is_levels else {}
             for place, name in enumerate(conditions):
                 _draw_row(axes, place, family.get((name, metric)), values.get(name, {}))
-                if name in random_play:
-                    look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
-                    axes.plot([random_play[name]] * 2, [place - 0.42, place + 0.42], **look)
-            if not is_levels:
+            if is_levels:
+                _draw_random_play(axes, conditions, _random_play(table, metric))
+            else:
                 axes.axvline(0, **RANDOM_LINE)
                 if axes.dataLim.width < _NO_WIDTH:
                     axes.set_xlim(-1, 1)
             axes.set_title(metric_title(metric, levels))
-            axes.set_yticks(range(len(conditions)), list(names.values()))
-            axes.locator_params(axis="x", nbins=3)
-            axes.grid(axis="y", color="#e6e6e6", linewidth=0.6)
-        panels[0].set_ylim(len(conditions) - 0.4, -0.6)
         by = factor_word(design.factors[0]) if len(design.factors) == 1 else "condition"
         sheet.title = f"{design.name}: outcome by {by}"
         note = f"{_levels_note(table)} Faint: single replicas. Dashed: random play."
@@ -389,6 +378,30 @@ def by_condition(
             note = f"{pairing}; means of {episodes_text(table)}; {INTERVALS}."
         sheet.caption = figure_caption(table, note)
     return Path(path)
+
+
+def _row_panels(sheet: Sheet, labels: Sequence[str], number: int) -> list[Axes]:
+    """Add panels with a row for each label, the first on top, as high as the labels need."""
+    names = [wrapped(label, min(_NAME_WIDTH, 0.3 * sheet.width_em)) for label in labels]
+    lines = [name.splitlines() for name in names]
+    high = (_LINE_HEIGHT * max(map(len, lines)) + 0.8) * len(names) + 7
+    beside = CHARACTER * max(len(line) for name in lines for line in name)
+    columns = sheet.fitting(number, 12.5)
+    panels = sheet.panels(number, columns=columns, high=high, beside=beside, sharey=True)
+    for axes in panels:
+        axes.set_yticks(range(len(names)), names)
+        axes.locator_params(axis="x", nbins=3)
+        axes.grid(axis="y", color="#e6e6e6", linewidth=0.6)
+    panels[0].set_ylim(len(names) - 0.4, -0.6)
+    return panels
+
+
+def _draw_random_play(axes: Axes, conditions: Sequence[str], random_play: Mapping[str, float]) -> None:
+    """Draw a dash for random play in the rows of the conditions that have it."""
+    look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
+    for place, name in enumerate(conditions):
+        if name in random_play:
+            axes.plot([random_play[name]] * 2, [place - 0.42, place + 0.42], **look)
 
 
 def _draw_row(axes: Axes, place: int, estimate: Estimate | None, values: Mapping[int, float]) -> None:
