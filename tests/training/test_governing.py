@@ -14,7 +14,7 @@ import cprl
 from cprl import keys
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
 from cprl.evaluation.cross_play import crossplay
-from cprl.evaluation.film import film
+from cprl.evaluation.film import record_episode
 from cprl.evaluation.populations import play_population
 from cprl.institutions import Governor, Quota, Tax
 from cprl.policies.governors import Constant, StockRule
@@ -250,7 +250,7 @@ def test_a_governor_of_a_quota_opens_and_closes_the_harvest():
 @pytest.mark.integration
 def test_a_film_draws_the_number_in_force_under_the_stock(tmp_path):
     run = cprl.run(replace(EXPERIMENT, governor=StockRule()), tmp_path / "run", **QUIET)
-    path, _ = film(run, tmp_path / "film.rrd", episode=0)
+    path, _ = record_episode(run, tmp_path / "film.rrd", episode=0)
     drawn, rates = column(path, "turn/rule", "Scalars:scalars")
     times, _ = column(path, "turn/stock", "Scalars:scalars")
     assert drawn == times

@@ -20,8 +20,8 @@ def commons_of(env: EnvBase) -> CommonsEnv | None:
     return base if isinstance(base, CommonsEnv) else None
 
 
-def game_played(env: EnvBase) -> Game | None:
-    """Return the game of the `CommonsEnv` under the transforms, or None for another game."""
+def commons_game_of(env: EnvBase) -> Game | None:
+    """Return the `cprl.Game` that an environment plays, or None for another game."""
     commons = commons_of(env)
     return None if commons is None else commons.game
 

@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons.game import Game
-from cprl.envs.unwrap import agent_count, game_played
+from cprl.envs.unwrap import agent_count, commons_game_of
 from cprl.institutions import COUNT_NAMES
 from cprl.keys import Turn
 from cprl.measuring.registry import (
@@ -508,12 +508,14 @@ class EpisodeTracker:
 
 def tracker_of(env: EnvBase, metrics: Sequence[Custom] = ()) -> EpisodeTracker:
     """Return an `EpisodeTracker` for all worlds of an environment, with or without transforms."""
-    return EpisodeTracker(env.batch_size.numel(), agent_count(env), game=game_played(env), metrics=metrics)
+    return EpisodeTracker(
+        env.batch_size.numel(), agent_count(env), game=commons_game_of(env), metrics=metrics
+    )
 
 
 def decisions_of(env: EnvBase) -> tuple[str, ...]:
     """Return the titles of the decisions in an episode, in the order of "in_force"."""
-    game = game_played(env)
+    game = commons_game_of(env)
     if game is not None and game.in_force:
         return tuple(ballot.title for ballot in game.in_force)
     (width,) = env.observation_spec[keys.IN_FORCE].shape[env.batch_dims :]

@@ -14,7 +14,7 @@ from cprl.commons.cells import Colour
 from cprl.commons.game import Game
 from cprl.commons.quirks import self_stays
 from cprl.envs.commons_env import CommonsEnv
-from cprl.envs.unwrap import game_played, joint_actions
+from cprl.envs.unwrap import commons_game_of, joint_actions
 from cprl.measuring.registry import (
     AGENT_TOTALS,
     COLLECTIVE_RETURN,
@@ -155,7 +155,7 @@ def plotted_numbers(
         replicas=env.batch_size.numel() // worlds,
         worlds=worlds,
         mean_over=worlds * ceil(mean_over / worlds),
-        metrics=(*metrics_for(reported, game_played(env)), *user_metrics),
+        metrics=(*metrics_for(reported, commons_game_of(env)), *user_metrics),
         has_tags="tagged_by" in reported,
         in_force=in_force,
         joint=joint,
