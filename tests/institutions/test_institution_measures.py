@@ -63,7 +63,7 @@ TAGS = np.array([2, 1, 1, 0])
 OF_LAW = [
     name
     for name, metric in METRICS.items()
-    if metric.is_of_institutions and "wanted" not in metric.needs  # which games with a governor have
+    if metric.is_of_institutions and "objective" not in metric.needs  # which games with a governor have
 ]
 OF_GROUPS = {name for name in OF_LAW if name.endswith(("_within", "_between"))}
 COUNTED = {
