@@ -23,7 +23,6 @@ from cprl.learners.learner import Learner, Memory, TrainingEngine as TrainingEng
 from cprl.learners.networks import COMPILED_STEPS, LaneNetworks, Update
 from cprl.learners.optimizers import UpdateRule
 from cprl.learners.plain import PlainNetworks, PlainReplay, PlainRollouts
-from cprl.learners.protocol import AnyLearner
 from cprl.learners.refusals import check_loss, refuse_other_networks
 from cprl.learners.replay import Replay
 from cprl.learners.rollouts import Rollouts
@@ -229,7 +228,7 @@ class Algorithm(Value, stored=False):
             compile=engine == "compiled" and memory.form.sequence_steps <= COMPILED_STEPS,
         )
 
-    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> AnyLearner:
+    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> Learner:
         """Return the learner of some agents in every replica.
 
         Raises:
@@ -374,7 +373,7 @@ class TeamAlgorithm(Algorithm, stored=False):
     is_one_lane: ClassVar[bool] = True
     """True if a team is one lane; else each member is a lane of its own."""
 
-    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> AnyLearner:
+    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> Learner:
         self.refuse_torchrl(engine)
         self.check_team(len(lanes.agents), lanes.reward)
         return Learner(self, replace(lanes, are_teams=self.is_one_lane), engine)

@@ -20,5 +20,4 @@ Modules, in the order in which one reads them:
     refusals       refuse losses and networks that do not fit the memory or the settings
     lola           the memory and networks of teams whose members anticipate how the others learn
     tabular        the memory and the tables of agents that learn by Q-learning in tables
-    protocol       AnyLearner: the methods that the training loop calls on any learner
 """

@@ -75,7 +75,8 @@ class Learner:
     """The learner of S agents of each of R replicas, by one algorithm.
 
     Each lane has its own network, targets, optimiser state, memory and random numbers, and learns exactly as
-    it would alone. A `cprl.learners.protocol.AnyLearner`.
+    it would alone. The training loop calls `begin` once, then in each turn `store`, `update` and
+    `end_episode`.
 
     Args:
         algorithm: a `cprl.algorithms.Algorithm`, which makes the networks, the memory and the loss.
