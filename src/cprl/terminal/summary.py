@@ -71,14 +71,11 @@ def summarise(
 def ordered_metrics(table: pa.Table) -> list[str]:
     """Return the names of all metrics in the order of their rows: of whole episodes, then of each agent.
 
-    The income follows the collective return. A metric of an agent has a name such as "agent_0/return".
+    A metric of an agent has a name such as "agent_0/return".
     """
-    metrics = [metric for metric in all_metrics(table) if metric != INCOME]
-    income_index = 1 if COLLECTIVE_RETURN in metrics else 0
-    metrics.insert(income_index, INCOME)
     amounts = [amount for amount in ("return", *AGENT_TOTALS) if amount in table.column_names]
     agents = range(len(table["agent"].unique()))
-    return [*metrics, *(f"agent_{agent}/{amount}" for amount in amounts for agent in agents)]
+    return [*all_metrics(table), *(f"agent_{agent}/{amount}" for amount in amounts for agent in agents)]
 
 
 def _is_summarised(name: str) -> bool:
