@@ -118,7 +118,7 @@ class TextTable(NamedTuple):
 
     def _texts(self) -> list[list[str]]:
         """Return the texts of all cells, with a star for bold ones."""
-        return [[_marked(cell, "{} *") for cell in row] for row in self.rows]
+        return [list(map(_marked_by_star, row)) for row in self.rows]
 
     def _narrow_texts(self, name_width: int) -> list[list[str]]:
         """Return the rows with wrapped names, and with intervals on a second line."""
@@ -248,6 +248,10 @@ def _is_bold(cell: TableCell) -> bool:
 def _marked(cell: TableCell, template: str) -> str:
     """Return the text of a cell, with differences that are not 0 in a template, see `Change.marked`."""
     return cell.marked(template) if isinstance(cell, Change) else str(cell)
+
+
+def _marked_by_star(cell: TableCell) -> str:
+    return _marked(cell, "{} *")
 
 
 def _in_markdown(cell: TableCell) -> str:
