@@ -87,7 +87,7 @@ def _greedy_yield(rate: Float64, around: list[Int64]) -> float:
     harvested = np.zeros(site_count, np.bool_)
 
     def gain(k: int) -> float:
-        """Return the yield of site k, less the loss of the harvested sites near it, if it is added."""
+        """Return the yield of a site, less the loss of the harvested sites near it, if it is added."""
         losers = around[k][harvested[around[k]]]
         counts = unharvested_near[losers]
         losses = rate[losers, counts] - rate[losers, counts - 1]

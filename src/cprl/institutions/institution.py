@@ -139,7 +139,7 @@ def with_ballots(game: Any, kind: type[Kind]) -> list[tuple[Kind, int]]:
 def columns(kind: type[Kind], arrays: Any, game: Any) -> dict[str, Any]:
     """Return the parameters that a module takes from the fields of its institutions.
 
-    Each entry of `arrays`, the class `Arrays` of the module, that is named like a field of `kind` gets a list
+    Each entry of `arrays`, the class of the module's arrays, that is named like a field of `kind` gets a list
     with the value of that field in each institution of the game, 0 for None. The entry "ballot" gets the
     indices of their ballots, or -1.
     """

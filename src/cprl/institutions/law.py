@@ -6,7 +6,7 @@
 from importlib import import_module
 from typing import Any, Final, cast
 
-from cprl.institutions import Law
+from cprl.institutions import Entries, Law
 from cprl.institutions.arrays import filled
 from cprl.institutions.governor import Governor
 from cprl.institutions.institution import Institution, columns, numbered
@@ -16,7 +16,7 @@ from cprl.institutions.votes import MOST_DECISIONS
 MODULES: Final = {
     name: import_module(kind.__module__)
     for name, kind in Law.__annotations__.items()
-    if kind.__name__ == "Arrays"
+    if kind not in (Ledger, Entries)
 }
 """The modules of institutions by their fields in `Law`, which have the names of the modules."""
 
@@ -57,21 +57,22 @@ def parameters(game: Any) -> dict[str, dict[str, Any]]:
     shown_entries = entries_shown(game)
     entries = {
         "module": [module_and_index[entry][0] for entry, _ in shown_entries],
-        "what": [module_and_index[entry][1] for entry, _ in shown_entries],
+        "entry": [module_and_index[entry][1] for entry, _ in shown_entries],
         "argument": [argument for _, argument in shown_entries],
-        "places": shows_places(game),
+        "shows_places": shows_places(game),
         "first_plane": len(game.game_channels),
     }
-    return {"entries": entries} | {name: _parameters(module, game) for name, module in MODULES.items()}
+    return {"entries": entries} | {name: _parameters(name, game) for name in MODULES}
 
 
-def _parameters(module: Any, game: Any) -> dict[str, Any]:
+def _parameters(name: str, game: Any) -> dict[str, Any]:
     """Return the parameters of one module: those of its function `parameters`, or else the fields of its
     institutions in the game."""
+    module: Any = MODULES[name]
     if hasattr(module, "parameters"):
         return module.parameters(game)
     (kind,) = (kind for kind in INSTITUTION_KINDS if kind.__module__ == module.__name__)
-    return columns(kind, module.Arrays, game)
+    return columns(kind, Law.__annotations__[name], game)
 
 
 def new_law(game: Any, worlds: int) -> Law:

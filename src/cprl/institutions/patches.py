@@ -45,7 +45,7 @@ class ClosedPatches(Limit):
             )
 
 
-class Arrays(NamedTuple):
+class PatchArrays(NamedTuple):
     """The patches of a game, on axis P; there are none in a game without `ClosedPatches`."""
 
     patch_of: Annotated[Int32, "K"]
@@ -65,40 +65,40 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
+    """Return the parameters in `PatchArrays` by name."""
     patch_of = game.patches if with_ballots(game, ClosedPatches) else np.zeros(0, np.int32)
     sites = np.bincount(patch_of)
-    return {"patch_of": patch_of, "sites": sites, **columns(ClosedPatches, Arrays, game)}
+    return {"patch_of": patch_of, "sites": sites, **columns(ClosedPatches, PatchArrays, game)}
 
 
-def is_patch_closed(patches: Arrays, site: int) -> bool:
+def is_patch_closed(patches: PatchArrays, site: int) -> bool:
     """Return whether the patch of a site is closed."""
     return patches.closed[patches.patch_of[site]]
 
 
-def count_apple(patches: Arrays, site: int, change: int) -> None:
+def count_apple(patches: PatchArrays, site: int, change: int) -> None:
     """Update the apples of a patch: an apple has appeared on a site (`change` 1) or gone (`change` -1)."""
     if patches.sites.shape[0] > 0:
         patches.stock[patches.patch_of[site]] += change
 
 
-def count_apples(patches: Arrays, stock: UInt8) -> None:
+def count_apples(patches: PatchArrays, stock: UInt8) -> None:
     """Count the apples on each patch, and close patches accordingly; `stock`: uint8 [K]."""
     if patches.sites.shape[0] > 0:
-        for p in range(patches.sites.shape[0]):
-            patches.stock[p] = 0
+        for patch in range(patches.sites.shape[0]):
+            patches.stock[patch] = 0
         for site in range(stock.shape[0]):
             patches.stock[patches.patch_of[site]] += stock[site]
         close_patches(patches)
 
 
-def close_patches(patches: Arrays) -> None:
+def close_patches(patches: PatchArrays) -> None:
     """Close the patches that hold too few apples for the coming turn, and open all others."""
-    for p in range(patches.sites.shape[0]):
-        patches.closed[p] = patches.stock[p] < patches.below[0]
+    for patch in range(patches.sites.shape[0]):
+        patches.closed[patch] = patches.stock[patch] < patches.below[0]
 
 
-def shows_closed(patches: Arrays, site: int) -> bool:
+def is_seen_as_closed(patches: PatchArrays, site: int) -> bool:
     """Return whether agents observe that the patch of a site is closed; `site`: -1 for a cell without one."""
     if patches.observed.shape[0] == 0 or not patches.observed[0] or site < 0:
         return False

@@ -101,7 +101,7 @@ class GraduatedSanctions(Institution):
             )
 
 
-class Arrays(NamedTuple):
+class SanctionArrays(NamedTuple):
     """The sanctions of a game by level, on axis L, and the level of each agent."""
 
     steps: Annotated[Int32, "N L"]
@@ -121,7 +121,7 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
+    """Return the parameters in `SanctionArrays` by name."""
     for sanctions, ballot in with_ballots(game, GraduatedSanctions):
         levels = np.atleast_2d(sanctions.freeze_steps)
         return {
@@ -137,71 +137,71 @@ def parameters(game: Any) -> dict[str, Any]:
     return {"steps": steps, **nothing}
 
 
-def forget_offences(sanctions: Arrays) -> None:
+def forget_offences(sanctions: SanctionArrays) -> None:
     """Clear the levels of all agents when an episode begins."""
-    for i in range(sanctions.level.shape[0]):
-        sanctions.level[i] = 0
-        sanctions.offence_step[i] = 0
+    for agent in range(sanctions.level.shape[0]):
+        sanctions.level[agent] = 0
+        sanctions.offence_step[agent] = 0
 
 
-def next_level(sanctions: Arrays, ledger: Ledger, i: int) -> int:
-    """Return the level at which the next offence of agent i is punished."""
+def next_level(sanctions: SanctionArrays, ledger: Ledger, agent: int) -> int:
+    """Return the level at which the next offence of an agent is punished."""
     if sanctions.ballot < 0:
-        return sanctions.level[i]
-    return sanctions.level[i] + int(ledger.in_force[sanctions.ballot])
+        return sanctions.level[agent]
+    return sanctions.level[agent] + int(ledger.in_force[sanctions.ballot])
 
 
-def time_out(sanctions: Arrays, ledger: Ledger, shooter: int, i: int) -> int:
-    """Return the turns that agent i misses for an offence at its level; `shooter`: who tagged it."""
-    level = next_level(sanctions, ledger, i)
+def time_out(sanctions: SanctionArrays, ledger: Ledger, shooter: int, agent: int) -> int:
+    """Return the turns that an agent misses for an offence at its level; `shooter`: who tagged it."""
+    level = next_level(sanctions, ledger, agent)
     return sanctions.steps[shooter, min(level, sanctions.steps.shape[1] - 1)]
 
 
-def offend(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> None:
-    """Let agent i pay the fine of its level for an offence, and raise its level by one."""
-    level = next_level(sanctions, ledger, i)
-    ledger.fines[i] += sanctions.fine[min(level, sanctions.fine.shape[0] - 1)]
-    sanctions.level[i] += 1
-    sanctions.offence_step[i] = turn
-    ledger.counts[i, SANCTIONS] += 1
+def offend(sanctions: SanctionArrays, ledger: Ledger, agent: int, turn: int) -> None:
+    """Let an agent pay the fine of its level for an offence, and raise its level by one."""
+    level = next_level(sanctions, ledger, agent)
+    ledger.fines[agent] += sanctions.fine[min(level, sanctions.fine.shape[0] - 1)]
+    sanctions.level[agent] += 1
+    sanctions.offence_step[agent] = turn
+    ledger.counts[agent, SANCTIONS] += 1
 
 
 def sanction_tag(
-    sanctions: Arrays, ledger: Ledger, tagged_by: Bool, i: int, turn: int, freeze_steps: int
+    sanctions: SanctionArrays, ledger: Ledger, tagged_by: Bool, agent: int, turn: int, freeze_steps: int
 ) -> int:
-    """Punish agent i for being tagged, if that is an offence, and return the turns that it misses.
+    """Punish an agent for being tagged, if that is an offence, and return the turns that it misses.
 
     `tagged_by`: bool [N, N]; `freeze_steps`: the turns that it misses if being tagged is no offence.
     """
     if not sanctions.for_tags:
         return freeze_steps
     steps = 0
-    for j in range(tagged_by.shape[0]):
-        if tagged_by[i, j]:
-            steps = max(steps, time_out(sanctions, ledger, j, i))
-    offend(sanctions, ledger, i, turn)
+    for shooter in range(tagged_by.shape[0]):
+        if tagged_by[agent, shooter]:
+            steps = max(steps, time_out(sanctions, ledger, shooter, agent))
+    offend(sanctions, ledger, agent, turn)
     return steps
 
 
-def sanction_violation(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> int:
-    """Punish agent i for a detected violation, if that is an offence, and return the turns that it misses."""
+def sanction_violation(sanctions: SanctionArrays, ledger: Ledger, agent: int, turn: int) -> int:
+    """Punish an agent for a detected violation, if that is an offence; return the turns that it misses."""
     if not sanctions.for_violations:
         return 0
-    steps = time_out(sanctions, ledger, i, i)
-    offend(sanctions, ledger, i, turn)
+    steps = time_out(sanctions, ledger, agent, agent)
+    offend(sanctions, ledger, agent, turn)
     return steps
 
 
-def forgive(sanctions: Arrays, turn: int) -> None:
+def forgive(sanctions: SanctionArrays, turn: int) -> None:
     """Lower the level of agents whose last offence, or last fall of level, is `recovery` turns ago."""
     if sanctions.recovery > 0:
-        for i in range(sanctions.level.shape[0]):
-            if sanctions.level[i] > 0 and turn - sanctions.offence_step[i] >= sanctions.recovery:
-                sanctions.level[i] -= 1
-                sanctions.offence_step[i] = turn
+        for agent in range(sanctions.level.shape[0]):
+            if sanctions.level[agent] > 0 and turn - sanctions.offence_step[agent] >= sanctions.recovery:
+                sanctions.level[agent] -= 1
+                sanctions.offence_step[agent] = turn
 
 
-def show_level(sanctions: Arrays, ledger: Ledger, i: int) -> float:
-    """Return what agent i observes of its level: the level relative to the highest one, 0..1."""
+def show_level(sanctions: SanctionArrays, ledger: Ledger, agent: int) -> float:
+    """Return what an agent observes of its level: the level relative to the highest one, 0..1."""
     last = max(1, sanctions.fine.shape[0] - 1, sanctions.steps.shape[1] - 1)
-    return min(next_level(sanctions, ledger, i), last) / last
+    return min(next_level(sanctions, ledger, agent), last) / last

@@ -97,7 +97,7 @@ class Levies(Institution):
         return tuple(group_by_agent[agent] for agent in sorted(group_by_agent))
 
 
-class Arrays(NamedTuple):
+class TaxArrays(NamedTuple):
     """The parameters and memory of all taxes of a game, one per index of axis T.
 
     A `Levies` counts as two taxes: one is paid out within groups, the other among all agents.
@@ -120,7 +120,7 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
+    """Return the parameters in `TaxArrays` by name."""
     # one row per tax: ballot, period, group of each agent, brackets
     rows: list[tuple[int, int, tuple[int, ...], tuple[tuple[float, float], ...]]] = []
     for tax, ballot in with_ballots(game, Tax):
@@ -139,44 +139,44 @@ def parameters(game: Any) -> dict[str, Any]:
     return {"from_": from_, "rate": rate, "ballot": ballots, "steps": steps, "group": group_of}
 
 
-def forget_income(taxes: Arrays) -> None:
+def forget_income(taxes: TaxArrays) -> None:
     """Clear the harvests that taxes remember when an episode begins."""
     for tax in range(taxes.income.shape[0]):
-        for i in range(taxes.income.shape[1]):
-            taxes.income[tax, i] = 0.0
+        for agent in range(taxes.income.shape[1]):
+            taxes.income[tax, agent] = 0.0
 
 
-def note_income(taxes: Arrays, i: int) -> None:
-    """Count a harvest of agent i for all taxes."""
+def note_income(taxes: TaxArrays, agent: int) -> None:
+    """Count a harvest of an agent for all taxes."""
     for tax in range(taxes.steps.shape[0]):
-        taxes.income[tax, i] += 1.0
+        taxes.income[tax, agent] += 1.0
 
 
-def collect_taxes(taxes: Arrays, ledger: Ledger, turn: int, is_over: bool) -> None:
+def collect_taxes(taxes: TaxArrays, ledger: Ledger, turn: int, is_over: bool) -> None:
     """Collect and pay out the taxes whose period ends with this turn; `is_over`: the episode ends with it."""
     agents = ledger.fines.shape[0]
     for tax in range(taxes.steps.shape[0]):
         if (is_over or turn % taxes.steps[tax] == 0) and has_income(taxes, tax):
-            for i in range(agents):
-                taxes.owed[i] = tax_of(taxes, ledger, tax, i)
-                ledger.fines[i] += taxes.owed[i]
-                taxes.income[tax, i] = 0.0
-            for i in range(agents):
-                if taxes.group[tax, i] >= 0:
-                    pay_out(taxes, ledger, tax, i)
+            for agent in range(agents):
+                taxes.owed[agent] = tax_of(taxes, ledger, tax, agent)
+                ledger.fines[agent] += taxes.owed[agent]
+                taxes.income[tax, agent] = 0.0
+            for agent in range(agents):
+                if taxes.group[tax, agent] >= 0:
+                    pay_out(taxes, ledger, tax, agent)
 
 
-def has_income(taxes: Arrays, tax: int) -> bool:
+def has_income(taxes: TaxArrays, tax: int) -> bool:
     """Return whether any agent harvested in the period of a tax."""
-    for i in range(taxes.income.shape[1]):
-        if taxes.income[tax, i] > 0:
+    for agent in range(taxes.income.shape[1]):
+        if taxes.income[tax, agent] > 0:
             return True
     return False
 
 
-def tax_of(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> float:
-    """Return the apples of a tax that agent i owes for its harvest in the period."""
-    income = taxes.income[tax, i]
+def tax_of(taxes: TaxArrays, ledger: Ledger, tax: int, agent: int) -> float:
+    """Return the apples of a tax that an agent owes for its harvest in the period."""
+    income = taxes.income[tax, agent]
     owed = 0.0
     if taxes.ballot[tax] >= 0:
         return ledger.in_force[taxes.ballot[tax]] * income
@@ -188,12 +188,12 @@ def tax_of(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> float:
     return owed
 
 
-def pay_out(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> None:
-    """Give agent i its equal part of the tax that the members of its group owed."""
+def pay_out(taxes: TaxArrays, ledger: Ledger, tax: int, agent: int) -> None:
+    """Give an agent its equal part of the tax that the members of its group owed."""
     pool = 0.0
     members = 0
-    for j in range(ledger.fines.shape[0]):
-        if taxes.group[tax, j] == taxes.group[tax, i]:
-            pool += taxes.owed[j]
+    for member in range(ledger.fines.shape[0]):
+        if taxes.group[tax, member] == taxes.group[tax, agent]:
+            pool += taxes.owed[member]
             members += 1
-    ledger.transfers[i] += pool / members
+    ledger.transfers[agent] += pool / members

@@ -75,7 +75,7 @@ class Vote(Institution):
         return [("in force", ballot)]
 
 
-class Arrays(NamedTuple):
+class BallotArrays(NamedTuple):
     """The parameters of all ballots of a game, one of them per index of axis V."""
 
     options: Annotated[Int32, "V"]
@@ -90,7 +90,7 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
+    """Return the parameters in `BallotArrays` by name."""
     ballots = game.in_force
     most_choices = max((len(ballot.choices) for ballot in ballots), default=1)
     choices = np.zeros((len(ballots), most_choices))
@@ -105,33 +105,33 @@ def parameters(game: Any) -> dict[str, Any]:
     }
 
 
-def is_due(ballots: Arrays, ballot: int, episode: int) -> bool:
+def is_due(ballots: BallotArrays, ballot: int, episode: int) -> bool:
     """Return whether a ballot is held in an episode, counted from 0."""
     return ballots.episodes[ballot] > 0 and episode % ballots.episodes[ballot] == 0
 
 
-def has_governor(ballots: Arrays) -> bool:
+def has_governor(ballots: BallotArrays) -> bool:
     """Return whether a governor sets the last number in force."""
     last = ballots.episodes.shape[0] - 1
     return last >= 0 and ballots.episodes[last] == 0
 
 
-def choice_of(ballots: Arrays, ballot: int, decision: int) -> int:
+def choice_of(ballots: BallotArrays, ballot: int, decision: int) -> int:
     """Return the index of the choice that a decision makes on a ballot; see `cprl.Game.ballots`."""
     for before in range(ballot):
         decision //= ballots.options[before]
     return decision % ballots.options[ballot]
 
 
-def votes_for(ballots: Arrays, ballot: int, decisions: Int64, choice: int) -> int:
+def votes_for(ballots: BallotArrays, ballot: int, decisions: Int64, choice: int) -> int:
     """Return the number of agents that decide for a choice on a ballot; `decisions`: int64 [N]."""
     votes = 0
-    for i in range(decisions.shape[0]):
-        votes += choice_of(ballots, ballot, decisions[i]) == choice
+    for agent in range(decisions.shape[0]):
+        votes += choice_of(ballots, ballot, decisions[agent]) == choice
     return votes
 
 
-def median_choice(ballots: Arrays, ballot: int, decisions: Int64) -> int:
+def median_choice(ballots: BallotArrays, ballot: int, decisions: Int64) -> int:
     """Return the index of the median of the N agents' choices; of two middle ones the lower."""
     choice = 0
     votes = votes_for(ballots, ballot, decisions, choice)
@@ -141,7 +141,7 @@ def median_choice(ballots: Arrays, ballot: int, decisions: Int64) -> int:
     return choice
 
 
-def elected_choice(ballots: Arrays, ballot: int, decisions: Int64, word: np.uint64) -> int:
+def elected_choice(ballots: BallotArrays, ballot: int, decisions: Int64, word: np.uint64) -> int:
     """Return the index of the choice with most votes; a uniform 32-bit word decides between equal ones."""
     most = 0
     tied = 0
@@ -162,7 +162,7 @@ def elected_choice(ballots: Arrays, ballot: int, decisions: Int64, word: np.uint
 
 
 def hold_ballot(
-    ballots: Arrays,
+    ballots: BallotArrays,
     ledger: Ledger,
     ballot: int,
     decisions: Int64,
@@ -181,6 +181,6 @@ def hold_ballot(
     ledger.in_force[ballot] = ballots.choices[ballot, choice]
 
 
-def show_in_force(ballots: Arrays, ledger: Ledger, ballot: int) -> float:
+def show_in_force(ballots: BallotArrays, ledger: Ledger, ballot: int) -> float:
     """Return what agents observe of a ballot: the value in force, relative to the highest choice."""
     return ledger.in_force[ballot] / ballots.choices[ballot, ballots.options[ballot] - 1]
