@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from cprl.institutions import Law
 
 
-def act(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch: Scratch) -> None:
+def apply_actions(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch: Scratch) -> None:
     """Apply each agent's action to its position, heading and beam; `actions`: int64 [N].
 
     Under the clash rule "in_turn" agents act one after another, in an order drawn by chance, and a clashing
@@ -38,14 +38,14 @@ def act(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch:
         draw_order(world, scratch)
     for turn_place in range(world.row.shape[0]):
         agent = scratch.order[turn_place] if tables.clashes == IN_TURN else turn_place
-        act_one(world, tables, law, actions, scratch, agent)
+        apply_action(world, tables, law, actions, scratch, agent)
         if world.fired[agent] or is_cleaning(world.groups.river, agent):
             note_shot(world, agent)
         if tables.clashes == IN_TURN and world.in_play[agent] and has_company(world, agent):
             go_back(world, scratch, agent)
 
 
-def act_one(
+def apply_action(
     world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch: Scratch, agent: int
 ) -> None:
     """Apply the action of an agent if it is in play, and note where it begins the turn."""

@@ -178,7 +178,7 @@ class Batch:
         in_force[:, -1] = options[rule]
         self.driver.write(self.law.ledger.in_force, in_force)
 
-    def seen(self) -> Float32:
+    def governor_features(self) -> Float32:
         """Return the features that the governor observes of each world, float32 [B, S], see
         `Governor.sees`."""
         assert self.game.governor is not None

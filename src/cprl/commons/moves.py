@@ -93,7 +93,7 @@ def has_company(world: Worlds, agent: int) -> bool:
 
 
 def settle_clashes(world: Worlds, tables: Tables, scratch: Scratch) -> None:
-    """Undo moves that clash, as `Rules.clashes` says; under "in_turn" `act` has undone them already."""
+    """Undo moves that clash, as `Rules.clashes` says; under "in_turn" `apply_actions` undid them already."""
     if tables.clashes == PAIRWISE:
         settle_pairwise(world, scratch)
     elif tables.clashes != IN_TURN:

@@ -62,17 +62,17 @@ class River(Value):
 class RiverArrays(NamedTuple):
     """The river of a game, which has R cells, and its state in each world."""
 
-    cell: Annotated[UInt32, "R"]
+    board_cell: Annotated[UInt32, "R"]
     """The index on the board of each cell of the river; cells as in `cprl.commons.tables.Tables`."""
-    at: Annotated[Int32, "cells"]
+    river_cell_at: Annotated[Int32, "cells"]
     """The index in the river of each cell of the board, or -1."""
     first_waste: Annotated[UInt8, "R"]
     """1 where a cell of the river has waste when an episode begins."""
     pollute_below: Annotated[Int64, "counts"]
     """Thresholds [R + 1], by the number of clean cells: one of them gets waste if a uniform 32-bit word is
     below the threshold."""
-    limit: float
-    free: float
+    pollution_limit: float
+    pollution_free: float
     clean_number: int
     """The index of the action "clean"; -1 if agents may not clean."""
     waste: Annotated[UInt8, "B R", InState(high=1, cleared=False)]
@@ -91,12 +91,12 @@ def parameters(game: Any) -> dict[str, Any]:
     river_index[cells] = range(len(cells))
     stays_clean_prob = 1 - river.pollution_prob
     return {
-        "cell": cells,
-        "at": river_index,
+        "board_cell": cells,
+        "river_cell_at": river_index,
         "first_waste": np.isin(np.arange(len(cells)), game.map.waste),
         "pollute_below": [threshold(1 - stays_clean_prob**count) for count in range(len(cells) + 1)],
-        "limit": river.pollution_limit,
-        "free": river.pollution_free,
+        "pollution_limit": river.pollution_limit,
+        "pollution_free": river.pollution_free,
         "clean_number": game.rules.actions.index(CLEAN) if river.may_clean else -1,
     }
 
@@ -156,7 +156,7 @@ def clean_column(world: "Worlds", tables: "Tables", river: RiverArrays, cleaner:
         cell = beam_cell(world, tables, cleaner, ahead, side)
         if tables.background[cell] == tables.paints[WALL]:
             return 0
-        river_cell = river.at[cell]
+        river_cell = river.river_cell_at[cell]
         if river_cell >= 0 and river.waste[river_cell] == 1:
             river.waste[river_cell] = 0
             river.waste_left[0] -= 1
@@ -178,9 +178,9 @@ def growth_share(river: RiverArrays | None) -> float:
     if river is None:
         return 1.0
     share = river.waste_left[0] / max(1, river.waste.shape[0])
-    if share >= river.limit:
+    if share >= river.pollution_limit:
         return 0.0
-    return min(1.0, (river.limit - share) / (river.limit - river.free))
+    return min(1.0, (river.pollution_limit - share) / (river.pollution_limit - river.pollution_free))
 
 
 def slowed(below: int, river: RiverArrays | None) -> int:

@@ -6,7 +6,7 @@ A game without signals is compiled without the code of this group.
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from cprl.commons.moves import cell_of
-from cprl.commons.views import look
+from cprl.commons.views import copy_window
 from cprl.values.array_types import UInt8
 
 if TYPE_CHECKING:
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 class SignalArrays(NamedTuple):
     """The numbers of a game with signals."""
 
-    kinds: int
+    signal_count: int
     """The number of different signals."""
     silent_actions: int
     """The number of actions that send no signal."""
@@ -28,7 +28,7 @@ class SignalArrays(NamedTuple):
 def parameters(game: Any) -> dict[str, Any]:
     """Return the numbers in `SignalArrays` by name."""
     return {
-        "kinds": game.rules.signals,
+        "signal_count": game.rules.signals,
         "silent_actions": game.tables.silent_actions,
         "first_plane": len(game.cell_channels),
     }
@@ -63,9 +63,9 @@ def draw_signals(
             picture[cell_of(world.row[agent], world.col[agent], tables)] = world.signal[agent]
     cells = tables.window_cells.shape[1]
     for agent in range(world.row.shape[0]):
-        look(world, tables, agent, scratch)
+        copy_window(world, tables, agent, scratch)
         planes = observation[agent].reshape(-1)
-        for signal in range(signals.kinds):
+        for signal in range(signals.signal_count):
             first = (signals.first_plane + signal) * cells
             for window_cell in range(cells):
                 planes[first + window_cell] = (scratch.seen[window_cell] == signal + 1) * tables.highest

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cprl.commons.actions import act
+from cprl.commons.actions import apply_actions
 from cprl.commons.apples import fill, harvest_and_grow, recount
 from cprl.commons.beam import find_hits, tag, take_out
 from cprl.commons.chance import BALLOT, DETECTION, END, draw
@@ -88,7 +88,7 @@ def play_turn(
     world.step[0] += 1
     begin_turn(world, law, decisions)
     count_down(world)
-    act(world, tables, law, actions, scratch)
+    apply_actions(world, tables, law, actions, scratch)
     settle_clashes(world, tables, scratch)
     clean(world, tables, world.groups.river, scratch, output.cleaned)
     output.regrown[0] = harvest_and_grow(world, tables, law, actions, scratch, output.harvest)

@@ -78,7 +78,7 @@ def paint_waste(tables: Tables, river: RiverArrays | None, picture: Int32) -> No
     if river is not None:
         for river_cell in range(river.waste.shape[0]):
             if river.waste[river_cell] == 1:
-                picture[river.cell[river_cell]] = tables.paints[WASTE]
+                picture[river.board_cell[river_cell]] = tables.paints[WASTE]
 
 
 def has_apple_ahead(world: Worlds, tables: Tables, agent: int) -> bool:
@@ -168,7 +168,7 @@ def paint(world: Worlds, tables: Tables, picture: Int32) -> None:
         paint_agents(world, tables, picture)
 
 
-def look(world: Worlds, tables: Tables, agent: int, scratch: Scratch) -> None:
+def copy_window(world: Worlds, tables: Tables, agent: int, scratch: Scratch) -> None:
     """Copy the part of the picture that an agent observes into `scratch.seen`, the farthest row first."""
     heading = world.heading[agent]
     origin = 0 if tables.sees_all else cell_of(world.row[agent], world.col[agent], tables)
@@ -182,9 +182,9 @@ def cut_window(world: Worlds, tables: Tables, agent: int, scratch: Scratch, wind
 
     The agent itself is in the middle of the last row, or `window_rows_behind` rows above that.
     """
-    # Two passes, so that the second writes contiguous memory, and unsigned indices in `look`, so that Numba
-    # does not check for negative ones: three times as fast as a plain loop (`benchmarks/env_steps.py`).
-    look(world, tables, agent, scratch)
+    # Two passes, so that the second writes contiguous memory, and unsigned indices in `copy_window`, so that
+    # Numba does not check for negative ones: three times as fast as a plain loop (`benchmarks/env_steps.py`).
+    copy_window(world, tables, agent, scratch)
     cells = tables.window_cells.shape[1]
     planes = window.reshape(-1)
     if tables.one_hot:
@@ -197,10 +197,10 @@ def cut_window(world: Worlds, tables: Tables, agent: int, scratch: Scratch, wind
                 ) * tables.highest
     else:
         for window_cell in range(cells):
-            paint = scratch.seen[window_cell]
-            planes[window_cell] = paint & 255
-            planes[cells + window_cell] = (paint >> 8) & 255
-            planes[2 * cells + window_cell] = (paint >> 16) & 255
+            colour = scratch.seen[window_cell]
+            planes[window_cell] = colour & 255
+            planes[cells + window_cell] = (colour >> 8) & 255
+            planes[2 * cells + window_cell] = (colour >> 16) & 255
 
 
 def draw_windows(world: Worlds, tables: Tables, scratch: Scratch, observation: UInt8) -> None:

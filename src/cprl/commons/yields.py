@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from cprl.commons.maps import Map
-from cprl.commons.near import growth, harvest_rates, sites_around
+from cprl.commons.near import growth_probs, harvest_rates, sites_around
 from cprl.commons.rules import Rules
 from cprl.values.array_types import Float64, Int64
 
@@ -64,7 +64,7 @@ def sustainable_yield(board: Map, rules: Rules) -> float:
     """
     check_proven(rules)
     around = sites_around(board, rules)
-    row_of_site, probs = growth(rules, np.array([len(sites) for sites in around], np.int32))
+    row_of_site, probs = growth_probs(rules, np.array([len(sites) for sites in around], np.int32))
     rates = harvest_rates(rules, probs)
     return _greedy_yield(np.broadcast_to(rates[row_of_site], (len(around), rates.shape[1])), around)
 

@@ -176,7 +176,7 @@ def _may_use(boundaries: Sequence[Boundaries], game: Any) -> Bool:
         signs = np.array([list(row) for row in boundary.regions])
         for agent in range(game.agents):
             on_board[rule, agent] = np.isin(signs, [OPEN, *boundary.signs_of(agent)])
-    return may_use.reshape(len(boundaries), game.agents, -1)
+    return may_use.reshape(len(boundaries), game.agents, tables.background.size)
 
 
 def is_foreign(boundaries: BoundaryArrays, rule: int, agent: int, cell: int) -> bool:

@@ -58,7 +58,7 @@ class PatchArrays(NamedTuple):
     is_stopped: Annotated[Bool, "L"]
     fine: Annotated[Float64, "L"]
     observed: Annotated[Bool, "L"]
-    closed: Annotated[Bool, "B P", DERIVED]
+    is_closed: Annotated[Bool, "B P", DERIVED]
     """True for patches that are closed in the coming turn."""
     stock: Annotated[Int32, "B P", DERIVED]
     """The number of apples on each patch."""
@@ -73,7 +73,7 @@ def parameters(game: Any) -> dict[str, Any]:
 
 def is_patch_closed(patches: PatchArrays, site: int) -> bool:
     """Return whether the patch of a site is closed."""
-    return patches.closed[patches.patch_of[site]]
+    return patches.is_closed[patches.patch_of[site]]
 
 
 def count_apple(patches: PatchArrays, site: int, change: int) -> None:
@@ -95,7 +95,7 @@ def count_apples(patches: PatchArrays, stock: UInt8) -> None:
 def close_patches(patches: PatchArrays) -> None:
     """Close the patches that hold too few apples for the coming turn, and open all others."""
     for patch in range(patches.sites.shape[0]):
-        patches.closed[patch] = patches.stock[patch] < patches.below[0]
+        patches.is_closed[patch] = patches.stock[patch] < patches.below[0]
 
 
 def is_seen_as_closed(patches: PatchArrays, site: int) -> bool:

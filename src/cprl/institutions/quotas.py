@@ -48,9 +48,9 @@ class Quota(Limit):
 class QuotaArrays(NamedTuple):
     """The parameters and memory of all `Quota` of a game, one of them per index of axis Q."""
 
-    unit: Annotated[Float64, "Q"]
+    window_yield: Annotated[Float64, "Q"]
     """The apples that an agent may harvest in a window at a share of 1."""
-    full: Annotated[Float64, "Q"]
+    largest_allowed: Annotated[Float64, "Q"]
     """The most apples that an agent may ever harvest in a window; what agents observe is relative to it."""
     share: Annotated[Float64, "Q"]
     ballot: Annotated[Int32, "Q"]
@@ -74,9 +74,13 @@ def parameters(game: Any) -> dict[str, Any]:
     ]
     for (quota, _), share in zip(quotas, largest_shares, strict=True):
         _warn_of_less_than_an_apple(quota, agent_yield * share)
-    unit = [agent_yield * quota.window_steps for quota, _ in quotas]
-    full = [share * apples for share, apples in zip(largest_shares, unit, strict=True)]
-    return {"unit": unit, "full": full, **columns(Quota, QuotaArrays, game)}
+    window_yield = [agent_yield * quota.window_steps for quota, _ in quotas]
+    largest_allowed = [share * apples for share, apples in zip(largest_shares, window_yield, strict=True)]
+    return {
+        "window_yield": window_yield,
+        "largest_allowed": largest_allowed,
+        **columns(Quota, QuotaArrays, game),
+    }
 
 
 def _warn_of_less_than_an_apple(quota: Quota, apples_per_turn: float) -> None:
@@ -105,7 +109,7 @@ def open_windows(quotas: QuotaArrays, ledger: Ledger, turn: int, stock_share: fl
                 share = ledger.in_force[quotas.ballot[quota]]
             if quotas.by_stock[quota]:
                 share *= stock_share
-            quotas.allowed[quota] = share * quotas.unit[quota]
+            quotas.allowed[quota] = share * quotas.window_yield[quota]
             for agent in range(quotas.taken.shape[1]):
                 quotas.taken[quota, agent] = 0
 
@@ -130,4 +134,4 @@ def show_quota(quotas: QuotaArrays, entry: int, quota: int, agent: int, turn: in
     if entry == 1:
         return (quotas.window_steps[quota] - turn % quotas.window_steps[quota]) / quotas.window_steps[quota]
     left = quotas.allowed[quota] - quotas.taken[quota, agent]
-    return left / quotas.full[quota] if left > 0 and quotas.full[quota] > 0 else 0.0
+    return left / quotas.largest_allowed[quota] if left > 0 and quotas.largest_allowed[quota] > 0 else 0.0

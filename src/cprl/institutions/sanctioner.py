@@ -66,7 +66,7 @@ class Sanctioner(Institution):
 class SanctionerArrays(NamedTuple):
     """The agents that may fire."""
 
-    listed: Annotated[Bool, "N"]
+    is_listed: Annotated[Bool, "N"]
     """True for agents that may fire if there is no election."""
     ballot: int
     """The ballot that elects the agent that may fire; -1 for none."""
@@ -78,7 +78,7 @@ def parameters(game: Any) -> dict[str, Any]:
     """Return the parameters in `SanctionerArrays` by name; without a `Sanctioner` all agents may fire."""
     sanctioner, ballot = next(iter(with_ballots(game, Sanctioner)), (Sanctioner(), -1))
     listed = sanctioner.agents or range(game.agents)
-    return {"listed": [agent in listed for agent in range(game.agents)], "ballot": ballot}
+    return {"is_listed": [agent in listed for agent in range(game.agents)], "ballot": ballot}
 
 
 def appoint(sanctioner: SanctionerArrays, ledger: Ledger) -> None:
@@ -87,7 +87,7 @@ def appoint(sanctioner: SanctionerArrays, ledger: Ledger) -> None:
         if sanctioner.ballot >= 0:
             sanctioner.may_fire[agent] = ledger.in_force[sanctioner.ballot] == agent
         else:
-            sanctioner.may_fire[agent] = sanctioner.listed[agent]
+            sanctioner.may_fire[agent] = sanctioner.is_listed[agent]
 
 
 def show_may_fire(sanctioner: SanctionerArrays, agent: int) -> float:

@@ -104,11 +104,11 @@ class GraduatedSanctions(Institution):
 class SanctionArrays(NamedTuple):
     """The sanctions of a game by level, on axis L, and the level of each agent."""
 
-    steps: Annotated[Int32, "N L"]
+    freeze_steps: Annotated[Int32, "N L"]
     """The time-out by shooter and level; [N, 0] without `GraduatedSanctions`."""
     fine: Annotated[Float64, "fines"]
     """The fine by level."""
-    recovery: int
+    recovery_steps: int
     """The turns without an offence after which a level falls; 0 for never."""
     for_tags: bool
     for_violations: bool
@@ -125,16 +125,16 @@ def parameters(game: Any) -> dict[str, Any]:
     for sanctions, ballot in with_ballots(game, GraduatedSanctions):
         levels = np.atleast_2d(sanctions.freeze_steps)
         return {
-            "steps": np.broadcast_to(levels, (game.agents, levels.shape[1])),
+            "freeze_steps": np.broadcast_to(levels, (game.agents, levels.shape[1])),
             "fine": sanctions.fines,
-            "recovery": sanctions.recovery_steps or 0,
+            "recovery_steps": sanctions.recovery_steps or 0,
             "for_tags": sanctions.is_for_tags,
             "for_violations": sanctions.on != "tags",
             "ballot": ballot,
         }
     steps = np.zeros((game.agents, 0))
-    nothing = {"fine": (), "recovery": 0, "for_tags": False, "for_violations": False, "ballot": -1}
-    return {"steps": steps, **nothing}
+    nothing = {"fine": (), "recovery_steps": 0, "for_tags": False, "for_violations": False, "ballot": -1}
+    return {"freeze_steps": steps, **nothing}
 
 
 def forget_offences(sanctions: SanctionArrays) -> None:
@@ -154,7 +154,7 @@ def next_level(sanctions: SanctionArrays, ledger: Ledger, agent: int) -> int:
 def time_out(sanctions: SanctionArrays, ledger: Ledger, shooter: int, agent: int) -> int:
     """Return the turns that an agent misses for an offence at its level; `shooter`: who tagged it."""
     level = next_level(sanctions, ledger, agent)
-    return sanctions.steps[shooter, min(level, sanctions.steps.shape[1] - 1)]
+    return sanctions.freeze_steps[shooter, min(level, sanctions.freeze_steps.shape[1] - 1)]
 
 
 def offend(sanctions: SanctionArrays, ledger: Ledger, agent: int, turn: int) -> None:
@@ -193,15 +193,18 @@ def sanction_violation(sanctions: SanctionArrays, ledger: Ledger, agent: int, tu
 
 
 def forgive(sanctions: SanctionArrays, turn: int) -> None:
-    """Lower the level of agents whose last offence, or last fall of level, is `recovery` turns ago."""
-    if sanctions.recovery > 0:
+    """Lower the level of agents whose last offence, or last fall of level, is `recovery_steps` turns ago."""
+    if sanctions.recovery_steps > 0:
         for agent in range(sanctions.level.shape[0]):
-            if sanctions.level[agent] > 0 and turn - sanctions.offence_step[agent] >= sanctions.recovery:
+            if (
+                sanctions.level[agent] > 0
+                and turn - sanctions.offence_step[agent] >= sanctions.recovery_steps
+            ):
                 sanctions.level[agent] -= 1
                 sanctions.offence_step[agent] = turn
 
 
 def show_level(sanctions: SanctionArrays, ledger: Ledger, agent: int) -> float:
     """Return what an agent observes of its level: the level relative to the highest one, 0..1."""
-    last = max(1, sanctions.fine.shape[0] - 1, sanctions.steps.shape[1] - 1)
+    last = max(1, sanctions.fine.shape[0] - 1, sanctions.freeze_steps.shape[1] - 1)
     return min(next_level(sanctions, ledger, agent), last) / last

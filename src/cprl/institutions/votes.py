@@ -82,10 +82,10 @@ class BallotArrays(NamedTuple):
     """The number of choices."""
     choices: Annotated[Float64, "V choices"]
     is_election: Annotated[Bool, "V"]
-    episodes: Annotated[Int32, "V"]
+    period_episodes: Annotated[Int32, "V"]
     """The number of episodes from one time that the ballot is held to the next; 0 for the number that a
     governor sets, on which no agent votes."""
-    override: Annotated[Int64, "V"]
+    override_below: Annotated[Int64, "V"]
     """The result is overridden if a uniform 32-bit word is below this threshold."""
 
 
@@ -100,20 +100,20 @@ def parameters(game: Any) -> dict[str, Any]:
         "options": [len(ballot.choices) for ballot in ballots],
         "choices": choices,
         "is_election": [ballot.is_election for ballot in ballots],
-        "episodes": [ballot.period_episodes for ballot in ballots],
-        "override": [threshold(ballot.override_prob) for ballot in ballots],
+        "period_episodes": [ballot.period_episodes for ballot in ballots],
+        "override_below": [threshold(ballot.override_prob) for ballot in ballots],
     }
 
 
 def is_due(ballots: BallotArrays, ballot: int, episode: int) -> bool:
     """Return whether a ballot is held in an episode, counted from 0."""
-    return ballots.episodes[ballot] > 0 and episode % ballots.episodes[ballot] == 0
+    return ballots.period_episodes[ballot] > 0 and episode % ballots.period_episodes[ballot] == 0
 
 
 def has_governor(ballots: BallotArrays) -> bool:
     """Return whether a governor sets the last number in force."""
-    last = ballots.episodes.shape[0] - 1
-    return last >= 0 and ballots.episodes[last] == 0
+    last = ballots.period_episodes.shape[0] - 1
+    return last >= 0 and ballots.period_episodes[last] == 0
 
 
 def choice_of(ballots: BallotArrays, ballot: int, decision: int) -> int:
@@ -172,7 +172,7 @@ def hold_ballot(
 
     `decisions`: int64 [N]; `words`: uniform random 32-bit words.
     """
-    if np.int64(words[0]) < ballots.override[ballot]:
+    if np.int64(words[0]) < ballots.override_below[ballot]:
         choice = np.int64(words[1] % np.uint64(ballots.options[ballot]))
     elif ballots.is_election[ballot]:
         choice = np.int64(elected_choice(ballots, ballot, decisions, words[2]))
