@@ -81,7 +81,9 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
         raise ValueError(f"the replicas are {list(replicas)}; allowed for cross_seed: at least 2")
     next_replica = dict(zip(replicas, (*replicas[1:], replicas[0]), strict=True))
     tables = (
-        play_fresh(fresh, loaded[labels[BACKGROUND]], agents, labels, roles=roles, among=loaded.values())
+        play_fresh(
+            fresh, loaded[labels[BACKGROUND]], agents, labels, roles=roles, compared_runs=loaded.values()
+        )
         for labels, agents, roles in _cells(loaded, diagonal, next_replica)
     )
     per_focal_agent = " with focal agent at each index"

@@ -204,7 +204,7 @@ def run_scenarios(
     check_scripted([(Scripted("greedy"), tuple(range(count)))], loaded.spaces, loaded.game)
     chosen = _choose_scenarios(loaded, scenarios)
     background_runs = _load_background_runs(loaded, chosen)
-    fresh = fresh_for([loaded], fresh, among=background_runs.values())
+    fresh = fresh_for([loaded], fresh, other_runs=background_runs.values())
 
     backgrounds = {}
     for scenario in chosen:

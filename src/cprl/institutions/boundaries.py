@@ -110,15 +110,6 @@ class Boundaries(Institution):
         return self.bite_fine is not None or self.regions[row][col] in OPEN + self.signs_of(agent)
 
     def check(self, game: Any) -> None:
-        self._check_size(game)
-        if self.owners is not None and len(self.owners) != game.agents:
-            raise ValueError(
-                f"Boundaries.owners has {len(self.owners)} entries; allowed: {game.agents}, one per agent"
-            )
-        self._check_signs(game.agents)
-
-    def _check_size(self, game: Any) -> None:
-        """Refuse regions that do not have the size of the map."""
         height = len(self.regions)
         width = len(self.regions[0])
         if (height, width) != (game.map.height, game.map.width):
@@ -126,6 +117,11 @@ class Boundaries(Institution):
                 f"Boundaries.regions is {height} x {width}; allowed: {game.map.height} x "
                 f"{game.map.width}, as the map"
             )
+        if self.owners is not None and len(self.owners) != game.agents:
+            raise ValueError(
+                f"Boundaries.owners has {len(self.owners)} entries; allowed: {game.agents}, one per agent"
+            )
+        self._check_signs(game.agents)
 
     def _check_signs(self, agents: int) -> None:
         """Refuse a sign of a region that no agent may use."""

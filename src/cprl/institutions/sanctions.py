@@ -105,7 +105,7 @@ class SanctionArrays(NamedTuple):
     """The sanctions of a game by level, on axis L, and the level of each agent."""
 
     freeze_steps: Annotated[Int32, "N L"]
-    """The time-out by shooter and level; [N, 0] without `GraduatedSanctions`."""
+    """The time-out by shooter and level."""
     fine: Annotated[Float64, "fines"]
     """The fine by level."""
     recovery_steps: int
@@ -121,20 +121,18 @@ class SanctionArrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `SanctionArrays` by name."""
-    for sanctions, ballot in with_ballots(game, GraduatedSanctions):
-        levels = np.atleast_2d(sanctions.freeze_steps)
-        return {
-            "freeze_steps": np.broadcast_to(levels, (game.agents, levels.shape[1])),
-            "fine": sanctions.fines,
-            "recovery_steps": sanctions.recovery_steps or 0,
-            "for_tags": sanctions.is_for_tags,
-            "for_violations": sanctions.on != "tags",
-            "ballot": ballot,
-        }
-    steps = np.zeros((game.agents, 0))
-    nothing = {"fine": (), "recovery_steps": 0, "for_tags": False, "for_violations": False, "ballot": -1}
-    return {"freeze_steps": steps, **nothing}
+    """Return the parameters in `SanctionArrays`; without `GraduatedSanctions` nothing is an offence."""
+    in_game = with_ballots(game, GraduatedSanctions)
+    sanctions, ballot = in_game[0] if in_game else (GraduatedSanctions(recovery_steps=None), -1)
+    levels = np.atleast_2d(sanctions.freeze_steps)
+    return {
+        "freeze_steps": np.broadcast_to(levels, (game.agents, levels.shape[1])),
+        "fine": sanctions.fines,
+        "recovery_steps": sanctions.recovery_steps or 0,
+        "for_tags": bool(in_game) and sanctions.is_for_tags,
+        "for_violations": bool(in_game) and sanctions.on != "tags",
+        "ballot": ballot,
+    }
 
 
 def forget_offences(sanctions: SanctionArrays) -> None:
