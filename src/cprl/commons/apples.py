@@ -19,7 +19,7 @@ from cprl.commons.chance import (
 )
 from cprl.commons.moves import cell_of
 from cprl.commons.quirks import keep_old_stock
-from cprl.commons.river import pollute, slowed
+from cprl.commons.river import pollute, reduced_threshold
 from cprl.commons.signals import SignalArrays, without_signal
 from cprl.institutions.hooks import note_apple, note_harvest, note_step, stops_harvest
 from cprl.values.array_types import Float32, Int64
@@ -147,7 +147,7 @@ def has_sprouted(world: Worlds, tables: Tables, scratch: Scratch, site: int) -> 
     first_byte = (scratch.words[site >> 2] >> (8 * (site & 3))) & LOW_BYTE
     rest = np.int64(draw(world, REGROWTH_REST + site)[0]) >> BYTE_BITS
     row = tables.regrow_row[site] if tables.regrow_by_share else 0
-    threshold = slowed(tables.regrow_below[row + world.near[site]], world.groups.river)
+    threshold = reduced_threshold(tables.regrow_below[row + world.near[site]], world.groups.river)
     return ((first_byte << REST_BITS) | rest) < threshold
 
 

@@ -183,7 +183,7 @@ def growth_share(river: RiverArrays | None) -> float:
     return min(1.0, (river.pollution_limit - share) / (river.pollution_limit - river.pollution_free))
 
 
-def slowed(below: int, river: RiverArrays | None) -> int:
+def reduced_threshold(below: int, river: RiverArrays | None) -> int:
     """Return the threshold `below` of a site's growth, reduced by the waste in the river."""
     if river is None:
         return below

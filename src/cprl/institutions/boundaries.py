@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from cprl.institutions.institution import Amount, Institution, columns, with_ballots
+from cprl.institutions.institution import Amount, Institution, field_values, with_ballots
 from cprl.institutions.ledger import OWN_BITES, TRESPASSES, Ledger, note_violation
 from cprl.values import Where, short_repr
 from cprl.values.array_types import Bool, Float64
@@ -157,7 +157,7 @@ def parameters(game: Any) -> dict[str, Any]:
         "is_stopped": [boundary.bite_fine is None for boundary in boundaries],
         "fine": [boundary.bite_fine or 0.0 for boundary in boundaries],
         "step_is_violation": [boundary.step_fine is not None for boundary in boundaries],
-        **columns(Boundaries, BoundaryArrays, game),
+        **field_values(Boundaries, BoundaryArrays, game),
     }
 
 

@@ -28,8 +28,8 @@ class Mediation(Institution):
     """The apples that the tagged agent receives."""
 
     entries: ClassVar[tuple[str, ...]] = ("violator",)
-    at_most: ClassVar[int | None] = 1
-    needs: ClassVar[tuple[str, ...]] = ("agents_apart",)
+    most_in_game: ClassVar[int | None] = 1
+    needed_switches: ClassVar[tuple[str, ...]] = ("agents_apart",)
     counts: ClassVar[tuple[str, ...]] = ("unjust_tags",)
 
     @property
@@ -40,7 +40,7 @@ class Mediation(Institution):
     def needs_tags(self) -> bool:
         return True
 
-    def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
+    def shown_entries(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
         return [("violator", agent) for agent in range(agents)]
 
 

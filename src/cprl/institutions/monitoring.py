@@ -44,7 +44,7 @@ class Monitoring(Institution):
     """The number of episodes from one election to the next; the first one is in the first episode."""
 
     entries: ClassVar[tuple[str, ...]] = ("detected", "elected")
-    at_most: ClassVar[int | None] = 1
+    most_in_game: ClassVar[int | None] = 1
     counts: ClassVar[tuple[str, ...]] = ("detections",)
 
     def __post_init__(self) -> None:
@@ -62,7 +62,7 @@ class Monitoring(Institution):
             period_episodes=self.period_episodes,
         )
 
-    def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
+    def shown_entries(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
         return [("detected", 0), *([("elected", ballot)] if self.monitor == ELECTED else [])]
 
     def check(self, game: Any) -> None:

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 
 from cprl.institutions.arrays import DERIVED
-from cprl.institutions.institution import Amount, Limit, columns, with_ballots
+from cprl.institutions.institution import Amount, Limit, field_values, with_ballots
 from cprl.values import Natural
 from cprl.values.array_types import Bool, Float64, Int32, UInt8
 
@@ -29,7 +29,7 @@ class ClosedPatches(Limit):
     """The fine in apples for each harvest in a closed patch, which is a violation, if it is detected. None
     makes such harvests impossible."""
 
-    at_most: ClassVar[int | None] = 1
+    most_in_game: ClassVar[int | None] = 1
     shows_places: ClassVar[bool] = True
     counts: ClassVar[tuple[str, ...]] = ("closed_bites",)
 
@@ -68,7 +68,7 @@ def parameters(game: Any) -> dict[str, Any]:
     """Return the parameters in `PatchArrays` by name."""
     patch_of = game.patches if with_ballots(game, ClosedPatches) else np.zeros(0, np.int32)
     sites = np.bincount(patch_of)
-    return {"patch_of": patch_of, "sites": sites, **columns(ClosedPatches, PatchArrays, game)}
+    return {"patch_of": patch_of, "sites": sites, **field_values(ClosedPatches, PatchArrays, game)}
 
 
 def is_patch_closed(patches: PatchArrays, site: int) -> bool:

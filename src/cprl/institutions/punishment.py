@@ -29,7 +29,7 @@ class Punishment(Institution):
     shot_cost: Amount = 0.0
     """The apples that each shot costs the shooter, whether it tags or not."""
 
-    at_most: ClassVar[int | None] = 1
+    most_in_game: ClassVar[int | None] = 1
 
     @property
     def needs_tags(self) -> bool:

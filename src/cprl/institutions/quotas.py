@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
 from cprl.institutions.arrays import STEPS, InState
-from cprl.institutions.institution import Amount, Limit, columns, with_ballots
+from cprl.institutions.institution import Amount, Limit, field_values, with_ballots
 from cprl.institutions.ledger import Ledger
 from cprl.values import Positive, Range
 from cprl.values.array_types import Bool, Float64, Int32
@@ -79,7 +79,7 @@ def parameters(game: Any) -> dict[str, Any]:
     return {
         "window_yield": window_yield,
         "largest_allowed": largest_allowed,
-        **columns(Quota, QuotaArrays, game),
+        **field_values(Quota, QuotaArrays, game),
     }
 
 

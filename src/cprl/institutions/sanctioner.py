@@ -36,7 +36,7 @@ class Sanctioner(Institution):
     equally likely."""
 
     entries: ClassVar[tuple[str, ...]] = ("may fire",)
-    at_most: ClassVar[int | None] = 1
+    most_in_game: ClassVar[int | None] = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()

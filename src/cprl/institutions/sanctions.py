@@ -53,7 +53,7 @@ class GraduatedSanctions(Institution):
     institution, and that is detected. "both": either of them."""
 
     entries: ClassVar[tuple[str, ...]] = ("sanction level",)
-    at_most: ClassVar[int | None] = 1
+    most_in_game: ClassVar[int | None] = 1
     counts: ClassVar[tuple[str, ...]] = ("sanctions", "returns_to_violation")
     voted_on: ClassVar[str] = "the level of a first offence"
 

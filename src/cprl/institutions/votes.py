@@ -71,7 +71,7 @@ class Vote(Institution):
             override_prob=self.override_prob,
         )
 
-    def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
+    def shown_entries(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
         return [("in force", ballot)]
 
 
