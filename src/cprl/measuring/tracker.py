@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from cprl import keys
 from cprl.commons.game import Game
 from cprl.commons.yields import unproven
-from cprl.envs.unwrap import agent_count, commons_of
+from cprl.envs.unwrap import agent_count, commons_game_of
 from cprl.institutions import COUNT_NAMES, Institution
 from cprl.keys import Turn
 from cprl.measuring.registry import (
@@ -520,10 +520,10 @@ class EpisodeTracker:
 def tracker_of(env: EnvBase, metrics: Sequence[Custom] = ()) -> EpisodeTracker:
     """Return an `EpisodeTracker` for all worlds of an environment, with its institutions, its sustainable
     yield, and custom metrics."""
-    commons = commons_of(env)
+    game = commons_game_of(env)
     wanted = None
-    if commons is not None and commons.game.governor is not None:
-        wanted = partial(welfare, commons.game)
+    if game is not None and game.governor is not None:
+        wanted = partial(welfare, game)
     return EpisodeTracker(
         env.batch_size.numel(),
         agent_count(env),
@@ -548,28 +548,28 @@ def yield_of_game(game: Game) -> dict[str, float]:
 def yield_of(env: EnvBase) -> dict[str, float]:
     """Return the arguments of an `EpisodeTracker` for yield_share; none for a game without a board of
     cprl."""
-    commons = commons_of(env)
-    return {} if commons is None else yield_of_game(commons.game)
+    game = commons_game_of(env)
+    return {} if game is None else yield_of_game(game)
 
 
 def institutions_of(env: EnvBase) -> tuple[Institution, ...]:
     """Return the institutions of a game of cprl, with or without transforms; () for another game."""
-    commons = commons_of(env)
-    return () if commons is None else commons.game.institutions
+    game = commons_game_of(env)
+    return () if game is None else game.institutions
 
 
 def metrics_of(env: EnvBase, reported: Collection[str]) -> tuple[str, ...]:
     """Return the metrics of an environment that reports these entries, without custom metrics and
     decisions."""
     metrics = metrics_for(reported, institutions_of(env))
-    return metrics if commons_of(env) is None else (*metrics, "yield_share")
+    return metrics if commons_game_of(env) is None else (*metrics, "yield_share")
 
 
 def decisions_of(env: EnvBase) -> tuple[str, ...]:
     """Return the titles of the decisions in an episode, in the order of "in_force"."""
-    commons = commons_of(env)
-    if commons is not None and commons.game.in_force:
-        return tuple(ballot.title for ballot in commons.game.in_force)
+    game = commons_game_of(env)
+    if game is not None and game.in_force:
+        return tuple(ballot.title for ballot in game.in_force)
     (width,) = env.observation_spec[keys.IN_FORCE].shape[env.batch_dims :]
     return tuple(f"decision {number}" for number in range(width))
 
