@@ -71,8 +71,7 @@ def export_turns(
             directory that `out` lies in. Actions and rewards of all agents are in the infos of each, as
             "joint_action" and "joint_reward".
         format: "csv", or "minari" with the package of this name.
-        episodes: the number of episodes, which are those of `cprl film` with the same replica and seed, from 0
-            on.
+        episodes: the number of episodes: those of `cprl film` with the same replica and seed, from 0 on.
         replica: the number of the replica.
         seed: the seed of the worlds and of all random choices.
 
