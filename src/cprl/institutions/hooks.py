@@ -31,9 +31,15 @@ from cprl.institutions.taxes import collect_taxes, forget_income, note_income
 from cprl.institutions.votes import show_in_force
 from cprl.values.array_types import Bool, Float64, UInt8
 
-SEASONS, QUOTAS, ROTATION, MONITORING, VOTES, SANCTIONS, MEDIATION = map(
-    Law._fields.index, ("seasons", "quotas", "rotation", "monitoring", "votes", "sanctions", "mediation")
-)
+(
+    SEASONS_MODULE,
+    QUOTAS_MODULE,
+    ROTATION_MODULE,
+    MONITORING_MODULE,
+    VOTES_MODULE,
+    SANCTIONS_MODULE,
+    MEDIATION_MODULE,
+) = map(Law._fields.index, ("seasons", "quotas", "rotation", "monitoring", "votes", "sanctions", "mediation"))
 """The indices in `Law` of the modules that show agents something, as `Entries.module` holds them."""
 
 
@@ -159,18 +165,18 @@ def shown_value(law: Law, index: int, agent: int, turn: int) -> float:
     module = law.entries.module[index]
     entry = law.entries.entry[index]
     argument = law.entries.argument[index]
-    if module == SEASONS:
+    if module == SEASONS_MODULE:
         return show_season(law.seasons, entry, argument, turn)
-    if module == QUOTAS:
+    if module == QUOTAS_MODULE:
         return show_quota(law.quotas, entry, argument, agent, turn)
-    if module == ROTATION:
+    if module == ROTATION_MODULE:
         return show_rotation(law.rotation, law.ledger, entry, argument, agent, turn)
-    if module == MONITORING:
+    if module == MONITORING_MODULE:
         return show_monitoring(law.monitoring, law.ledger, entry, argument, agent)
-    if module == VOTES:
+    if module == VOTES_MODULE:
         return show_in_force(law.votes, law.ledger, argument)
-    if module == SANCTIONS:
+    if module == SANCTIONS_MODULE:
         return show_level(law.sanctions, law.ledger, agent)
-    if module == MEDIATION:
+    if module == MEDIATION_MODULE:
         return show_mark(law.mediation, law.ledger, argument, agent, turn)
     return show_may_fire(law.sanctioner, agent)
