@@ -62,9 +62,9 @@ class FreshEpisode(NamedTuple):
         if not self.is_typical:
             return f"Replica {self.replica}, episode {self.episode}. {averages_sentence}".rstrip()
         averages = averages_of(self.run)
-        turns, apples = _median(averages)
+        survival, apples = _median(averages)
         middle = "the medians of the replicas" if len(averages) > 1 else "the averages"
-        near = f"{middle}, {turns:,.0f} turns and {apples:,.0f} apples"
+        near = f"{middle}, {survival:,.0f} turns and {apples:,.0f} apples"
         reason = f"chosen of the first {EPISODES_TRIED} for a life and a harvest near {near}"
         numbers = f"replica {self.replica}, episode {self.episode}"
         return f"A typical episode ({numbers}), {reason}. {averages_sentence}"
@@ -87,14 +87,14 @@ def averages_of(run: LoadedRun) -> dict[int, tuple[float, float]]:
         return {}
     groups = where(table, replica=tuple(run.replicas)).group_by("replica")
     rows = groups.aggregate([(metric, "mean") for metric in metrics]).sort_by("replica")
-    turns, apples = (rows[f"{metric}_mean"].to_pylist() for metric in metrics)
-    return dict(zip(rows["replica"].to_pylist(), zip(turns, apples, strict=True), strict=True))
+    survival, apples = (rows[f"{metric}_mean"].to_pylist() for metric in metrics)
+    return dict(zip(rows["replica"].to_pylist(), zip(survival, apples, strict=True), strict=True))
 
 
 def _median(averages: Mapping[int, tuple[float, float]]) -> tuple[float, float]:
     """Return the medians over replicas of the turns and of the apples."""
-    turns, apples = np.median([*averages.values()], axis=0).tolist()
-    return turns, apples
+    survival, apples = np.median([*averages.values()], axis=0).tolist()
+    return survival, apples
 
 
 def averages_in_words(run: LoadedRun) -> str:
@@ -102,10 +102,10 @@ def averages_in_words(run: LoadedRun) -> str:
     averages = averages_of(run)
     if not averages:
         return ""
-    turns, apples = map(_list_in_words, zip(*averages.values(), strict=True))
+    survival, apples = map(_list_in_words, zip(*averages.values(), strict=True))
     agents, noun = ("people", "groups") if has_people(run.specs) else ("trained agents", "replicas")
     replicas = f" of the {len(averages)} {noun}" if len(averages) > 1 else ""
-    return f"The {agents}{replicas} last {turns} turns on average and pick {apples} apples."
+    return f"The {agents}{replicas} last {survival} turns on average and pick {apples} apples."
 
 
 def _list_in_words(numbers: Sequence[float]) -> str:
