@@ -292,6 +292,9 @@ class CommonsEnv(LeanStepEnv):
 
         Returns:
             A numpy array in RGB: uint8 [rows, columns, 3] for one world, uint8 [B, rows, columns, 3] for all.
+
+        Raises:
+            ValueError: before the first reset, or for a world that the environment does not have.
         """
         batch = self.worlds
         if not batch.has_begun:

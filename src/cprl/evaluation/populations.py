@@ -98,7 +98,7 @@ WorldSource: TypeAlias = LoadedRun | FreshGame
 
 
 def world_source_of(game_or_run: Any) -> WorldSource:
-    """Return a run as it is, and a game as a `FreshGame`."""
+    """Return a run as it is, and a game as a `FreshGame`; refuse anything else."""
     if isinstance(game_or_run, LoadedRun):
         return game_or_run
     if not is_playable(game_or_run):
@@ -257,6 +257,10 @@ def play_population(game_or_run: Any, agents: Sequence[AgentSpec], fresh: Fresh 
             `Frozen(run, agent, replica=None)` is the agent of the run's replica r.
         fresh: the number of episodes, their seed, and the replicas that play. With the same seed all
             populations play in the same worlds.
+
+    Raises:
+        ValueError: for agents that learn, people, another number of agents than the game's, no replica in
+            common, or a seed with which a run was trained.
     """
     world_source = world_source_of(game_or_run)
     fresh = fresh_of_specs(agents, fresh)
@@ -294,6 +298,9 @@ def agent_named(source: str, agent: int, *, replica: int | None = None, name: st
         source: the name of a scripted policy; or the directory of a run, whose agent with this index plays.
         replica: the replica of the run; None for the same as the one that plays.
         name: the name of the argument, for a refusal.
+
+    Raises:
+        ValueError: for a word that is neither.
     """
     if source in SCRIPTED_POLICIES:
         return Scripted(source)
