@@ -1,7 +1,7 @@
 """run: train an experiment, save its agents, evaluate them in fresh worlds, and report."""
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -368,7 +368,7 @@ def _play_at_random(run: _OpenRun, viewer: "ViewerCallback | None") -> list[Epis
 def _train(run: _OpenRun, viewer: "ViewerCallback | None", checkpointer: Checkpointer) -> Training:
     """Train, and save what the agents have learned."""
     viewers = [] if viewer is None else [viewer]
-    evaluations = Evaluations(run.directory, run.experiment, run.env, run.population)
+    evaluations = Evaluations(run.directory, run.experiment, run.population)
     with _loggers(run.experiment, run.directory, resumes=run.resume) as loggers:
         table = EpisodeTable(run.directory / "episodes.parquet", resumable=True)
         with table, ProgressBar.of(run.experiment, run.population.calls.in_words) as progress_bar:
@@ -413,7 +413,7 @@ def _evaluate(
     tables = write_evaluation(run.directory, episodes, replicas=run.experiment.replicas)
     if viewer is not None:
         viewer.finished(episodes)
-    trained = _trained_label(list(run.population.learners.values()))
+    trained = _trained_label(run.population.learners.values())
     random_table = labelled(tables["random"], policy="random")
     trained_table = labelled(tables["trained"], policy=trained)
     return store_agent_names(pa.concat_tables([random_table, trained_table]), agent_names(run.env))
@@ -452,7 +452,7 @@ def _summarise(run: _OpenRun, training: Training, evaluation: pa.Table, figure: 
     )
 
 
-def _trained_label(learners: Sequence[AnyLearner]) -> str:
+def _trained_label(learners: Collection[AnyLearner]) -> str:
     """Return the label of trained agents in tables, with the epsilons of those that explore by one.
 
     Examples: "trained", "trained, epsilon 0.05", "agents" if no agent learns.
