@@ -188,9 +188,9 @@ class Experiment(Value, stored=False, called="experiment"):
         return Length.of(vars(self), clock)
 
     @property
-    def specs(self) -> tuple[AgentSpec | GovernorSpec, ...]:
-        """Return the specifications of all agents, and last that of the governor, if it has one."""
-        return self.agents if self.governor is None else (*self.agents, self.governor)
+    def specs(self) -> tuple[AgentSpec | GovernorSpec | None, ...]:
+        """Return the specifications of all agents, and last that of the governor, or None."""
+        return *self.agents, self.governor
 
     @property
     def schedule(self) -> Schedule:
