@@ -16,7 +16,7 @@ from cprl.envs.env_state import transforms_state
 from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
 from cprl.experiment.engine import about_engine, begun_with, engine_of, planned_updates
-from cprl.learners.protocol import AnyLearner
+from cprl.learners.learner import Learner
 from cprl.measuring.table import labelled, store_agent_names, where
 from cprl.measuring.tracker import Episode, try_custom_metrics
 from cprl.policies.asking import CALLS
@@ -428,7 +428,7 @@ def _summarise(run: _OpenRun, training: Training, evaluation: pa.Table, figure: 
     )
 
 
-def _trained_label(learners: Collection[AnyLearner]) -> str:
+def _trained_label(learners: Collection[Learner]) -> str:
     """Return the label of trained agents in tables, with the epsilons of those that explore by one.
 
     Examples: "trained", "trained, epsilon 0.05", "agents" if no agent learns.
