@@ -111,6 +111,5 @@ class Governing:
         self.actor.load_state_dict(state["actor"])
         if self.learner is not None:
             self.learner.load_state_dict(state["learner"])
-        period = state["period"]
-        self._period = {name: entry.view(len(entry), -1).numpy() for name, entry in period.items()}
+        self._period = {name: entry.numpy() for name, entry in state["period"].items()}
         self._loss = state["loss"]
