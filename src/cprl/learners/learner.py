@@ -18,6 +18,7 @@ from cprl.keys import Turn
 from cprl.learners.draw import Draw
 from cprl.learners.lanes import Lanes
 from cprl.learners.networks import LaneNetworks
+from cprl.learners.settings import LearningRateDecay
 from cprl.learners.transitions import LaneTurn, TransitionForm
 from cprl.networks.agent import acting_network
 from cprl.objectives.rewards import RewardModel
@@ -173,7 +174,7 @@ class Learner:
         schedule = getattr(self.settings, "epsilon", None)
         epsilon = 0.0 if schedule is None else schedule(self.steps)  # stochastic policies have no epsilon
         self.actor.explore_with(epsilon)
-        if getattr(self.settings, "learning_rate_end", None) is not None:
+        if isinstance(self.settings, LearningRateDecay):
             self.lane_networks.learning_rate = self.settings.learning_rate_at(self.steps)
         if getattr(self.algorithm, "entropy_coeff_end", None) is not None:
             self.lane_networks.set_entropy_coeff(self.algorithm.entropy_coeff_at(self.steps))
