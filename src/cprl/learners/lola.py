@@ -35,7 +35,7 @@ class Members(nn.ModuleList):
         by_member = observation.unbind(-1 - first.observation_dims)
         return torch.stack([network(entry) for network, entry in zip(self, by_member, strict=True)], -2)
 
-    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Tensor:
+    def outputs(self, observation: Tensor) -> Tensor:
         """Map the observations of lanes, [R x S, k, *shape], to their outputs, [R x S, k, A]."""
         by_replica = observation.reshape(-1, len(self), *observation.shape[1:]).transpose(1, 2)
         return self.forward(by_replica).transpose(1, 2).flatten(0, 1)
@@ -88,14 +88,13 @@ class LOLANetworks(nn.Module):
             torch_optimizer(critic_rule, self.critics.parameters(), fused=None),
         ]
 
-    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Tensor:
-        """Return the outputs of actors, part 0, or critics, part 1, with their current weights, [R x S, k,
-        ...]."""
-        return (self.actors, self.critics)[part].outputs(observation)
+    def outputs(self, observation: Tensor) -> Tensor:
+        """Return the outputs of actors with their current weights, [R x S, k, A]."""
+        return self.actors.outputs(observation)
 
-    def playing(self, *inputs: Tensor) -> Tensor:
-        """Return the outputs by which members act in training."""
-        return self.players.outputs(*inputs)
+    def playing(self, observation: Tensor) -> Tensor:
+        """Return the outputs by which members act in training, [R x S, k, A]."""
+        return self.players.outputs(observation)
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
         """Return copies of the current weights of the actor of a lane."""
