@@ -11,7 +11,7 @@ from torchrl.objectives import LossModule
 
 from cprl.keys import Turn
 from cprl.learners.draw import Draw
-from cprl.learners.lanes import Lanes
+from cprl.learners.lanes import Lanes, outputs_by_agent
 from cprl.learners.optimizers import UpdateRule, clip_by_norm, torch_optimizer
 from cprl.learners.refusals import refuse_other_networks
 from cprl.learners.rollouts import Rollout, advantages
@@ -37,8 +37,8 @@ class Members(nn.ModuleList):
 
     def outputs(self, observation: Tensor) -> Tensor:
         """Map the observations of lanes, [R x S, k, *shape], to their outputs, [R x S, k, A]."""
-        by_replica = observation.reshape(-1, len(self), *observation.shape[1:]).transpose(1, 2)
-        return self.forward(by_replica).transpose(1, 2).flatten(0, 1)
+        outputs: Tensor = outputs_by_agent(self.forward, len(self))(observation)
+        return outputs
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
         """Return copies of the weights of a lane, as the state dict of its network."""
