@@ -213,7 +213,6 @@ class LOLARollouts:
 
     def write(self, turn: Turn, lane_turn: LaneTurn) -> None:
         """Store a turn; `cprl.learners.learner.Memory.write` says the arguments."""
-        self.rollout.refuse_full()
         self.rollout.write(lane_turn, self._phase)
 
     def due(self, networks: LOLANetworks) -> Iterator[Draw]:
