@@ -229,7 +229,7 @@ def test_an_agent_values_actions_alone_as_among_others_to_the_last_bit():
     spaces = presets.game("two_complex").spaces
     shape = spaces.observation_shape
     torch.manual_seed(0)
-    agents = [StoredAgent(network=MLPNetwork(shape, 8), algorithm="DQN") for _ in range(8)]
+    agents = [StoredAgent(spec=DQN, network=MLPNetwork(shape, 8)) for _ in range(8)]
     seen = torch.randint(0, 256, (8, 1, *shape), dtype=torch.uint8)
 
     def values(lanes):

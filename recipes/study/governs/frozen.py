@@ -15,7 +15,6 @@ harvest and equality of the harvest.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -29,7 +28,7 @@ from cprl.commands.recipe_command import exit_with_message
 from cprl.measuring.playing import evaluate, turns
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY
 from cprl.measuring.table import all_metrics, by_replica, complete, where
-from cprl.policies.actors import random_agents
+from cprl.policies.actors import LaneActor, random_agents
 from cprl.policies.decisions import stored_decisions
 from cprl.policies.joint_policy import JointPolicy
 from cprl.policies.rng import Purpose
@@ -63,17 +62,18 @@ def play(run: LoadedRun, exploration: float) -> pa.Table:
     worlds = experiment.evaluation_episodes
 
     def agents_at(agent: int) -> list[StoredAgent]:
-        stored = [run.agent(agent, replica=replica) for replica in replicas]
-        return [replace(one, epsilon=exploration) for one in stored]
+        return [run.agent(agent, replica=replica) for replica in replicas]
 
     policy = stored_policies(
-        [agents_at(agent) for agent in range(run.game.agents)],
+        [agents_at(agent) for agent in range(len(run.all_specs))],
         run.playing,
         replicas=replicas,
         worlds=worlds,
         seed=experiment.seed,
-        governor=run.governor(replicas),
     )
+    for actor in policy.actors:
+        if isinstance(actor, LaneActor):
+            actor.epsilon = exploration
     env = make_worlds(experiment, experiment.replicas * worlds, fresh=True)
     if all(ballot.period_episodes == 1 for ballot in run.game.in_force):  # else decisions stay in force
         next(turns(env, _random_policy(run)))
@@ -128,7 +128,7 @@ def is_the_evaluation(trial: Trial, table: pa.Table) -> bool:
 def explores_as_ever(run: LoadedRun, exploration: float) -> bool:
     """Return whether agents explore so much in the run's own evaluation, or have no exploration."""
     agents = [run.agent(agent, replica=run.replicas[0]) for agent in range(run.game.agents)]
-    return all(one.network is None or one.stochastic or one.epsilon == exploration for one in agents)
+    return all(one.epsilon in (None, exploration) for one in agents)
 
 
 def played(trial: Trial, explorations: Sequence[float]) -> pa.Table:

@@ -56,7 +56,7 @@ def agents_of(run: LoadedRun, stored_replicas: Mapping[int, int] | None = None) 
 
 def scripted_agent(policy: ScriptedPolicy) -> AgentOfReplica:
     """Return an agent that follows a scripted policy in every replica."""
-    return lambda _: StoredAgent(scripted=policy)
+    return lambda _: StoredAgent(spec=Scripted(policy))
 
 
 def frozen_agent(run: LoadedRun, spec: Frozen) -> AgentOfReplica:
@@ -160,12 +160,11 @@ def policies_of(
     """Return the joint policy of all agents in the lanes of these replicas."""
     stored = [list(map(agent, replicas)) for agent in agents]
     return stored_policies(
-        stored,
+        [*stored, place.governor(replicas)],
         place.playing,
         replicas=replicas,
         worlds=fresh.episodes,
         seed=fresh.seed,
-        governor=place.governor(replicas),
     )
 
 

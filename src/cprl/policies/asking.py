@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
-from http.client import HTTPException
 from os.path import isabs
 from pathlib import Path
 from threading import Lock
@@ -38,12 +37,6 @@ _FIELDS: Final = (
 """What is kept of a call."""
 _MOST_BYTES: Final = 2**20
 """The longest answer that is read."""
-_USAGE: Final = ("prompt_tokens", "completion_tokens")
-_BROKEN: Final = (
-    *(HTTPException, ValueError, LookupError, TypeError, AttributeError),
-    *(ArithmeticError, RecursionError),
-)
-"""What reading half an answer, or one of another form, raises."""
 _BUSY: Final = (408, 429)
 """The statuses below 500 after which a call is tried again."""
 
@@ -143,10 +136,11 @@ class Calls:
         by_hash = dict(zip(hashes, questions, strict=True))
         new = [by_hash[name] for name in by_hash if name not in self.kept]
         self._most = model.max_calls
-        if new and model.stored is not None:
-            self._take(model, new)
-        elif new:
-            left = model.max_calls - sum(call["tries"] > 0 for call in self.kept.values())
+        if model.stored is not None:
+            for question in new:
+                self._keep(self._stored_call(model, question))
+        else:
+            left = model.max_calls - self._made
             most_tries = [1 + model.retries if index < left else 0 for index in range(len(new))]
             with ThreadPoolExecutor(model.concurrency) as pool:
                 list(pool.map(partial(self._make, model, read), new, most_tries))
@@ -185,20 +179,17 @@ class Calls:
             }
         )
 
-    def _take(self, model: Model, questions: Sequence[Question]) -> None:
-        """Take calls from another run; refuse those that it does not keep."""
+    def _stored_call(self, model: Model, question: Question) -> dict[str, Any]:
+        """Return a call of another run; refuse one that it does not keep."""
         path = Path(str(model.stored)) / CALLS
         if path not in self._stored:
             self._stored[path] = read_calls(path)
         stored = self._stored[path]
-        for question in questions:
-            request = question.request(model)
-            name = _hash(request)
-            if name not in stored:
-                raise ValueError(
-                    f"{path} keeps no answer for {question.call}: {_differs(stored, question.call, request)}"
-                )
-            self._keep(stored[name])
+        request = question.request(model)
+        if _hash(request) not in stored:
+            differs = _differs(stored, question.call, request)
+            raise ValueError(f"{path} keeps no answer for {question.call}: {differs}")
+        return stored[_hash(request)]
 
     def _keep(self, call: dict[str, Any]) -> None:
         with self._lock:
@@ -210,20 +201,26 @@ class Calls:
 
     def in_words(self) -> str:
         """Return how many calls were made, their tokens, failures and costs; "" without any."""
-        calls = self.kept.values()
-        if not calls:
+        if not self.kept:
             return ""
-        made = sum(call["tries"] > 0 for call in calls)
-        tokens = sum(call["prompt_tokens"] for call in calls)
-        answered = sum(call["answer_tokens"] for call in calls)
-        failed = sum(call["failure"] is not None for call in calls)
-        words = f"{made:,} calls, {tokens:,} + {answered:,} tokens, {failed:,} without a usable answer"
-        dollars = sum(call["dollars"] for call in calls)
+        tokens = f"{self._total('prompt_tokens'):,} + {self._total('answer_tokens'):,} tokens"
+        failed = sum(call["failure"] is not None for call in self.kept.values())
+        words = f"{self._made:,} calls, {tokens}, {failed:,} without a usable answer"
+        dollars = self._total("dollars")
         if dollars:
             words += f", {dollars:,.4f} US dollars"
         if dollars and self._most:
-            words += f" ({self._most:,} such calls: {dollars / made * self._most:,.2f})"
+            words += f" ({self._most:,} such calls: {dollars / self._made * self._most:,.2f})"
         return words
+
+    @property
+    def _made(self) -> int:
+        """Return how many of the calls were made."""
+        return sum(call["tries"] > 0 for call in self.kept.values())
+
+    def _total(self, name: str) -> Any:
+        """Return the sum of a number of all calls."""
+        return sum(call[name] for call in self.kept.values())
 
 
 class _Outcome(NamedTuple):
@@ -268,7 +265,8 @@ def _post(model: Model, request: dict[str, Any]) -> _Outcome:
         table = json.loads(_body(message, model.timeout_s))
         answer = table["choices"][0]["message"]["content"]
         usage = table.get("usage") or {}
-        prompt_tokens, answer_tokens = (int(usage.get(name) or 0) for name in _USAGE)
+        prompt_tokens = int(usage.get("prompt_tokens") or 0)
+        answer_tokens = int(usage.get("completion_tokens") or 0)
     except HTTPError as error:
         is_busy = error.code in _BUSY or error.code >= 500
         return _Outcome(None, f"status {error.code}", may_retry=is_busy, is_refused=not is_busy)
@@ -277,7 +275,7 @@ def _post(model: Model, request: dict[str, Any]) -> _Outcome:
         if isinstance(reason, TimeoutError):
             return _Outcome(None, "no answer in time", may_retry=True)
         return _Outcome(None, f"no connection: {reason}", may_retry=True, is_refused=True)
-    except _BROKEN as error:
+    except Exception as error:  # half an answer, or one of any other form
         return _Outcome(None, f"a broken answer: {type(error).__name__}", may_retry=True)
     failure = None if isinstance(answer, str) else "an answer without text"
     return _Outcome(None if failure else answer, failure, prompt_tokens, answer_tokens)

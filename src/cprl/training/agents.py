@@ -1,8 +1,7 @@
 """Population: the agents of an experiment that learn, follow a script, or were trained by an earlier run."""
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from typing import Any, get_args
 
 import torch
@@ -24,7 +23,7 @@ from cprl.objectives.rewards import reward_name
 from cprl.policies.actors import random_agents
 from cprl.policies.asking import Calls
 from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
-from cprl.policies.governors import Script, governor_spaces
+from cprl.policies.governors import governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_names, lane_seeds
@@ -35,6 +34,7 @@ from cprl.population import (
     GovernorSpec,
     Language,
     Learning,
+    OwnPast,
     Pool,
     Scripted,
     Team,
@@ -43,16 +43,17 @@ from cprl.population import (
     refuse_sharing,
     refuse_undecided,
     specs_by_agent,
+    stored_in,
 )
 from cprl.training.governing import Governing
+from cprl.training.pools import PoolActor
 from cprl.training.stored import (
     LoadedRun,
-    PoolActor,
     StoredAgent,
     decision_values,
     load,
     stored_actors,
-    trained_agent,
+    stored_agent,
 )
 from cprl.values import Custom, instantiate, short_repr
 
@@ -126,8 +127,20 @@ class Population:
             if isinstance(spec, Learning | Team):
                 _refuse_only_in_play(spec, env)
                 self.learners[agents] = self._make_learner(spec, agents, engine, starts)
-        self._pools: dict[int, PoolActor] = {}
         self._stored_agents = self._load_stored_agents(weights or {})
+        self._pools = {
+            agent: PoolActor(
+                stored,
+                partial(stored_actors, playing=self.playing, worlds=worlds),
+                seeds=lane_seeds(
+                    seed, replicas=self._replica_numbers, agents=[agent], purpose=Purpose.EXPLORATION
+                ),
+                worlds=worlds,
+                present=self._present,
+            )
+            for agent, stored in self._stored_agents.items()
+            if isinstance(self._specs_by_agent[agent], Pool)
+        }
         self.governor = self._make_governor(governor, governor_from_turn)
         """The governor, which counts as the agent after the last one, and how it learns; None without one."""
         self.others: dict[ActorAgents, nn.Module] = self.other_actors(Purpose.EXPLORATION, worlds=worlds)
@@ -211,59 +224,43 @@ class Population:
         for agent, spec in enumerate(self._specs_by_agent):
             if isinstance(spec, Learning | Team):
                 lanes = [lane_name(replica, agent) for replica in replicas]
-                agents.append([trained_agent(spec, networks[lane], decisions.get(lane)) for lane in lanes])
+                agents.append(
+                    [
+                        StoredAgent(spec=spec, network=networks[lane], decisions=decisions.get(lane))
+                        for lane in lanes
+                    ]
+                )
             else:
                 agents.append([others[agent][self._replica_numbers.index(replica)] for replica in replicas])
         return agents
 
     def _load_stored_agents(self, weights: Mapping[str, str]) -> dict[int, list[StoredAgent]]:
-        """Make the pools; return the scripted and frozen agents of each replica by index, the governor last.
-        Each stored run is read once."""
-        runs: dict[str, LoadedRun] = {}
-
-        def frozen(spec: Frozen, *, governs: bool = False) -> list[StoredAgent]:
-            if spec.run not in runs:
-                runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
-                if not governs:
-                    _refuse_other_game(runs[spec.run], self.spaces, self._game, is_to_decide=True)
-            if governs:
-                _refuse_other_governor(runs[spec.run], spec, self._game)
-            replicas = map(spec.replica_for, self._replica_numbers)
-            stored = [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
-            return [replace(one, calls=self.calls) for one in stored]
-
-        seeds = partial(lane_seeds, self.seed, replicas=self._replica_numbers, purpose=Purpose.EXPLORATION)
+        """Return the agents of each replica that do not learn by index, pools without past selves. Each
+        stored run is read once."""
+        earlier = cache(lambda run: load(run, weights=weights.get(run)))
         agents: dict[int, list[StoredAgent]] = {}
         for agent, spec in enumerate(self._specs_by_agent):
-            if isinstance(spec, Scripted):
-                agents[agent] = [StoredAgent(scripted=spec.policy)] * self.replicas
-            elif isinstance(spec, Script):
-                agents[agent] = [StoredAgent(scripted=spec)] * self.replicas
-            elif isinstance(spec, Language):
-                stored = StoredAgent(scripted=spec.fallback, language=spec, calls=self.calls)
-                agents[agent] = [stored] * self.replicas
-            elif isinstance(spec, Frozen):
-                agents[agent] = frozen(spec, governs=agent == self.spaces.agents)
-            elif isinstance(spec, Pool):
-                self._pools[agent] = PoolActor(
-                    list(map(frozen, spec.runs)),
-                    self.playing,
-                    seeds=seeds(agents=[agent]),
-                    worlds=self.worlds,
-                    draw=spec.draw,
-                    own_past=spec.own_past,
-                    present=partial(self._present, spec.own_past),
-                )
+            if isinstance(spec, Learning | Team):
+                continue
+            for frozen in stored_in(spec).values():
+                if agent == self.spaces.agents:
+                    _refuse_other_governor(earlier(frozen.run), frozen, self._game)
+                else:
+                    _refuse_other_game(earlier(frozen.run), self.spaces, self._game, is_to_decide=True)
+            agents[agent] = [
+                stored_agent(spec, replica, calls=self.calls, load=earlier)
+                for replica in self._replica_numbers
+            ]
         return agents
 
-    def _present(self, own_past: Any) -> list[StoredAgent]:
+    def _present(self, own_past: OwnPast) -> list[StoredAgent]:
         """Return copies of the agent of an `OwnPast` as it is now, of each replica."""
         agent = own_past.agent
-        spec: Any = self._specs_by_agent[agent]
+        spec = self._specs_by_agent[agent]
         (learner,) = (learner for agents, learner in self.learners.items() if agent in agents)
         networks = learner.networks()
         names = lane_names(replicas=self._replica_numbers, agents=[agent])
-        return [trained_agent(spec, networks[name], None) for name in names]
+        return [StoredAgent(spec=spec, network=networks[name]) for name in names]
 
     def _others_as_stored(self) -> dict[int, list[StoredAgent]]:
         """Return the agents of each replica that do not learn by index, pools as they are now."""
@@ -354,9 +351,9 @@ class Population:
         weights = {}
         for replica in self._replica_numbers:
             stored_replica = source.replica_for(replica)
-            for agent, stored_agent in zip(agents, sources, strict=True):
-                where = f"{lane_name(stored_replica, stored_agent)} of {source.run}"
-                stored = run.agent(stored_agent, replica=stored_replica)
+            for agent, source_agent in zip(agents, sources, strict=True):
+                where = f"{lane_name(stored_replica, source_agent)} of {source.run}"
+                stored = run.agent(source_agent, replica=stored_replica)
                 weights[lane_name(replica, agent)] = _loadable_weights(stored, algorithm, self.spaces, where)
         return weights
 
@@ -481,10 +478,11 @@ def _loadable_weights(
     name = type(algorithm).__name__
     if stored.network is None:
         raise ValueError(f"{where} is scripted, without weights; allowed: an agent that learned")
-    if stored.stochastic != algorithm.stochastic:
+    is_stochastic = stored.algorithm.stochastic
+    if is_stochastic != algorithm.stochastic:
         meanings = {True: "the logits of a policy", False: "action values"}
         raise ValueError(
-            f"the network of {where} outputs {meanings[stored.stochastic]}; {name} learns "
+            f"the network of {where} outputs {meanings[is_stochastic]}; {name} learns "
             f"{meanings[algorithm.stochastic]}"
         )
     weights = stored.network.state_dict()

@@ -190,15 +190,12 @@ class Evaluations:
         for group in consecutive_groups(sorted(replicas)):
             env = make_worlds(experiment, len(group) * worlds, first=group[0] * worlds, fresh=True)
             load_transforms_state(env, transforms_state(self._env))
-            stored = self._population.as_stored(group)
-            agents = self._population.spaces.agents
             policies = stored_policies(
-                stored[:agents],
+                self._population.as_stored(group),
                 self._population.playing,
                 replicas=group,
                 worlds=worlds,
                 seed=seed,
-                governor=stored[agents] if len(stored) > agents else (),
             )
             episodes = evaluate(env, policies, metrics=experiment.metrics)
             for index, replica in enumerate(group):
