@@ -122,10 +122,12 @@ def test_the_environment_reads_the_rule_and_shows_what_can_be_seen():
 
 
 def test_a_governor_sees_the_equality_of_the_harvests_of_the_episode_so_far():
-    sight = Governor(sets="tax.rate", sees=("equality", "time"))
+    governor = Governor(sets="tax.rate", sees=("equality", "time"))
     apples = np.array([[3, 1, 0], [0, 0, 0], [2, 2, 2]])
     steps = np.array([4, 0, 2])
-    seen = sight.see(apples[:, 0] / 9, steps, apples, apples * 0, 8)
+    seen = governor.observe(
+        stock=apples[:, 0] / 9, elapsed_steps=steps, harvested=apples, violations=apples * 0, horizon_steps=8
+    )
     assert seen[:, 1].tolist() == [0.5, 0.0, 0.25]
     assert seen[1, 0] == 1, "nobody has less than another"
     assert seen[::2, 0].tolist() == pytest.approx(social.equality(apples[::2]).tolist())

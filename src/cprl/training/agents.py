@@ -1,6 +1,6 @@
 """Population: the agents of an experiment that learn, follow a script, or were trained by an earlier run."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from typing import Any, get_args
 
@@ -20,10 +20,9 @@ from cprl.measuring.registry import OPTIONAL_ENTRIES, reported_by
 from cprl.networks.agent import acting_network
 from cprl.networks.recurrent import state_shape_of
 from cprl.objectives.rewards import reward_name
-from cprl.policies.actors import random_agents
 from cprl.policies.asking import Calls
-from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
-from cprl.policies.governors import governor_spaces
+from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes
+from cprl.policies.governors import GovernorActor, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_names, lane_seeds
@@ -54,6 +53,8 @@ from cprl.training.stored import (
     load,
     stored_actors,
     stored_agent,
+    stored_governor,
+    stored_policies,
 )
 from cprl.values import Custom, instantiate, short_repr
 
@@ -126,15 +127,13 @@ class Population:
         for spec, agents in groups:
             if isinstance(spec, Learning | Team):
                 _refuse_only_in_play(spec, env)
-                self.learners[agents] = self._make_learner(spec, agents, engine, starts)
+                self.learners[agents] = self._make_learner(spec, agents, engine, self.spaces, starts=starts)
         self._stored_agents = self._load_stored_agents(weights or {})
         self._pools = {
             agent: PoolActor(
                 stored,
                 partial(stored_actors, playing=self.playing, worlds=worlds),
-                seeds=lane_seeds(
-                    seed, replicas=self._replica_numbers, agents=[agent], purpose=Purpose.EXPLORATION
-                ),
+                seeds=self._seeds(Purpose.EXPLORATION)(agents=[agent]),
                 worlds=worlds,
                 present=self._present,
             )
@@ -166,53 +165,56 @@ class Population:
             decisions = self.decisions.without_exploration(
                 Purpose.EVALUATED_DECISIONS, replicas=self.replicas, worlds=worlds
             )
-        governor = None if self.governor is None else self.governor.evaluation_actor(worlds)
-        return JointPolicy(actors, decisions=decisions, governor=governor)
+        return JointPolicy(actors, decisions=decisions, governor=self.governor_actor(worlds))
 
     def random_policy(self, worlds: int) -> JointPolicy:
         """Return policies that take every action, and every choice of a decision, with equal probability."""
-        everyone = tuple(range(self.spaces.agents))
-        actors = random_agents(self.spaces, everyone, replicas=self.replicas, seed=self.seed, worlds=worlds)
-        if self._game is None:
-            return JointPolicy(actors)
-        decisions = stored_decisions(
-            self._game,
-            {},
+        agents = [[StoredAgent(spec=Scripted("random"))] * self.replicas] * len(self._specs_by_agent)
+        return stored_policies(
+            agents,
+            self.playing,
             replicas=range(self.replicas),
             worlds=worlds,
             seed=self.seed,
             purpose=Purpose.RANDOM_PLAY,
+            decides=Purpose.RANDOM_PLAY,
         )
-        governor = None if self.governor is None else self.governor.random_actor(worlds)
-        return JointPolicy(actors, decisions=decisions, governor=governor)
+
+    def governor_actor(self, worlds: int) -> GovernorActor | None:
+        """Return an actor of the current governor for several worlds of each replica; None without one."""
+        if self.governor is None or self.governor.learner is None:
+            return self._stored_governor(Purpose.EVALUATION, worlds)
+        return GovernorActor(self.governor.actor.governor, self.governor.learner.evaluation_actor(worlds))
+
+    def _stored_governor(self, purpose: Purpose, worlds: int) -> GovernorActor | None:
+        """Return the actor of a governor that does not learn, with random numbers for a purpose."""
+        stored = self._stored_agents.get(self.spaces.agents, ())
+        return stored_governor(stored, self.playing, seeds=self._seeds(purpose), worlds=worlds)
 
     def networks(self) -> dict[str, nn.Module]:
         """Return copies of the learners' current acting networks, by "replica_0/agent_0" and so on, and the
         networks of past selves, see `PoolActor.networks`."""
         networks: dict[str, nn.Module] = {}
-        governors = {} if self.governor is None else self.governor.learners
-        for learner in [*self.learners.values(), *governors.values()]:
+        governors = [] if self.governor is None else [self.governor.learner]
+        for learner in filter(None, [*self.learners.values(), *governors]):
             networks |= learner.networks()
         for pool in self._pools.values():
             networks |= pool.networks()
         return networks
 
     def _make_governor(self, spec: GovernorSpec | None, from_turn: int) -> Governing | None:
-        if spec is None:
+        if self._game is None or self._game.governor is None:
             return None
-        assert self._game is not None
-        agent = self.spaces.agents
-        lanes = Lanes(
-            governor_spaces(self._game),
-            agents=(agent,),
-            replicas=self.replicas,
-            worlds=self.worlds,
-            seed=self.seed,
-            first_replica=self._replica_numbers.start,
-            device=self.device,
-        )
-        stored = self._stored_agents.get(agent, ())
-        return Governing(self._game, spec, lanes, stored=stored, from_turn=from_turn)
+        actor = self._stored_governor(Purpose.EXPLORATION, self.worlds)
+        learner = None
+        if isinstance(spec, Learning):
+            spaces = governor_spaces(self._game)
+            learner = self._make_learner(spec, (self.spaces.agents,), "eager", spaces)
+            actor = GovernorActor(self._game.governor, learner.actor)
+        if actor is None:
+            return None
+        actor.from_turn = from_turn
+        return Governing(self._game, actor, learner)
 
     def as_stored(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
         """Return copies of the current agents of some replicas, by agent and replica; the governor, if there
@@ -278,21 +280,26 @@ class Population:
         """
         numbers = self._replica_numbers[:replicas]
         others = self._others_as_stored()
-        others.pop(self.spaces.agents, None)  # the governor is no agent
-        agents = {agent: stored[: len(numbers)] for agent, stored in others.items()}
+        agents = {
+            agent: stored[: len(numbers)] for agent, stored in others.items() if agent < self.spaces.agents
+        }
         kinds = {
             agent: (getattr(self._specs_by_agent[agent], "run", None), stored[0].kind)
             for agent, stored in agents.items()
         }
-        seeds = partial(lane_seeds, self.seed, replicas=numbers, purpose=purpose)
         return stored_actors(
             agents,
             self.playing,
             kinds=kinds,
-            seeds=seeds,
+            seeds=self._seeds(purpose, replicas),
             worlds=worlds,
             asks=purpose is not Purpose.EXHIBITION,  # viewers cost no calls
         )
+
+    def _seeds(self, purpose: Purpose, replicas: int | None = None) -> Callable[..., list[tuple[int, ...]]]:
+        """Return a function of some `agents` that returns the seeds of their lanes for one purpose."""
+        numbers = self._replica_numbers[:replicas]
+        return partial(lane_seeds, self.seed, replicas=numbers, purpose=purpose)
 
     def _make_decider(self) -> BanditDecider | None:
         sizes = () if self._game is None else ballot_sizes(self._game)
@@ -314,11 +321,17 @@ class Population:
         )
 
     def _make_learner(
-        self, spec: Learning | Team, agents: tuple[int, ...], engine: Any, starts: bool
+        self,
+        spec: Learning | Team,
+        agents: tuple[int, ...],
+        engine: Any,
+        spaces: Spaces,
+        *,
+        starts: bool = False,
     ) -> AnyLearner:
         start_from = self._start_weights(spec, agents) if starts else {}
         lanes = Lanes(
-            self.spaces,
+            spaces,
             agents=agents,
             replicas=self.replicas,
             worlds=self.worlds,
@@ -415,11 +428,18 @@ def _refuse_other_game(
 
 
 def _refuse_other_governor(run: LoadedRun, spec: Frozen, game: Any) -> None:
-    """Refuse a stored governor that sees or chooses from something else than that of the game."""
-    pair = _sees_and_options(run.game), _sees_and_options(game)
-    _refuse_unequal(f"the game of {run.path}", "has", {"a governor that sees and chooses from": pair})
-    if spec.agent != run.game.agents:
-        raise ValueError(f"governor is {spec}; allowed: the agent after the last one, {run.game.agents}")
+    """Refuse a stored agent that is no governor, or sees or chooses from something else than that of the
+    game."""
+    if not spec.agent == run.game.agents < len(run.all_specs):
+        raise ValueError(
+            f"governor is {spec}; allowed: the governor of a run, as the agent after the last one"
+        )
+    stored = run.game.governor
+    pairs = {
+        "a governor that sees": (stored.sees, game.governor.sees),
+        "a governor with the options": (stored.options, game.governor.options),
+    }
+    _refuse_unequal(f"the game of {run.path}", "has", pairs)
 
 
 def _pairs(
@@ -447,11 +467,6 @@ def _refuse_unequal(subject: str, verb: str, pairs: Mapping[str, tuple[Any, Any]
     for name, (there, here) in pairs.items():
         if there != here:
             raise ValueError(f"{subject} {verb} {name} {there}; this game has {here}")
-
-
-def _sees_and_options(game: Any) -> Any:
-    governor = getattr(game, "governor", None)
-    return None if governor is None else (governor.sees, governor.options)
 
 
 def _ballot_choices(game: Game) -> list[tuple[str, tuple[float, ...]]]:

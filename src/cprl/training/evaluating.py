@@ -190,13 +190,9 @@ class Evaluations:
         for group in consecutive_groups(sorted(replicas)):
             env = make_worlds(experiment, len(group) * worlds, first=group[0] * worlds, fresh=True)
             load_transforms_state(env, transforms_state(self._env))
-            policies = stored_policies(
-                self._population.as_stored(group),
-                self._population.playing,
-                replicas=group,
-                worlds=worlds,
-                seed=seed,
-            )
+            stored = self._population.as_stored(group)
+            playing = self._population.playing
+            policies = stored_policies(stored, playing, replicas=group, worlds=worlds, seed=seed)
             episodes = evaluate(env, policies, metrics=experiment.metrics)
             for index, replica in enumerate(group):
                 played[replica] = episodes[index * worlds : (index + 1) * worlds]

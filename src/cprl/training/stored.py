@@ -150,11 +150,11 @@ class LoadedRun:
         governor = self.experiment.governor
         return self.specs if governor is None else [*self.specs, governor]
 
-    def governor(self, replicas: Sequence[int]) -> list[StoredAgent]:
-        """Return the governor of each of some replicas; [] without one."""
+    def governor(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
+        """Return a list of the governor of each of some replicas; [] without one."""
         if self.experiment.governor is None:
             return []
-        return [self.agent(self.game.agents, replica=replica) for replica in replicas]
+        return [[self.agent(self.game.agents, replica=replica) for replica in replicas]]
 
     @cached_property
     def spaces(self) -> Spaces:
@@ -376,52 +376,53 @@ def stored_policies(
     replicas: Sequence[int],
     worlds: int,
     seed: int,
+    purpose: Purpose = Purpose.EVALUATION,
+    decides: Purpose = Purpose.EVALUATED_DECISIONS,
 ) -> JointPolicy:
     """Return the policies of stored agents of some replicas; agents of one kind are lanes of one actor.
 
     Args:
-        agents: the stored agents, by agent and replica. The governor is the agent after the last one; without
-            it, or if it is empty, the first option stays in force.
-        seed: the seed of random numbers, with the replica and the agent.
+        agents: the stored agents, by agent and replica; the governor, if one decides, comes last.
+        seed: the seed of random numbers, with the replica, the agent and the purpose.
+        purpose: the purpose of the random numbers of actions.
+        decides: that of the random numbers of decisions on ballots.
     """
     by_index = dict(enumerate(agents))
-    governor = by_index.pop(playing.agents, ())
-    seeds = partial(lane_seeds, seed, replicas=replicas, purpose=Purpose.EVALUATION)
+    seeds = partial(lane_seeds, seed, replicas=replicas, purpose=purpose)
+    governor = stored_governor(by_index.pop(playing.agents, ()), playing, seeds=seeds, worlds=worlds)
+    decisions = None
+    if isinstance(playing, Game):
+        stored = decision_values(by_index)
+        decisions = stored_decisions(
+            playing, stored, replicas=replicas, worlds=worlds, seed=seed, purpose=decides
+        )
     actors = stored_actors(by_index, playing, seeds=seeds, worlds=worlds, stacks=True)
-    if not isinstance(playing, Game):
-        return JointPolicy(actors)
-    stored = decision_values(by_index)
-    decisions = stored_decisions(playing, stored, replicas=replicas, worlds=worlds, seed=seed)
-    governs = None
-    if governor:
-        governs = stored_governor(playing, governor, seeds=seeds(agents=[playing.agents]), worlds=worlds)
-    return JointPolicy(actors, decisions=decisions, governor=governs)
+    return JointPolicy(actors, decisions=decisions, governor=governor)
 
 
 def stored_governor(
-    game: Game,
     stored: Sequence[StoredAgent],
+    playing: Game | Spaces,
     *,
-    seeds: Sequence[Sequence[int]],
+    seeds: Callable[..., Sequence[Sequence[int]]],
     worlds: int,
-) -> GovernorActor:
+) -> GovernorActor | None:
     """Return the actor of a governor that does not learn.
 
     Args:
-        stored: the governor of each replica.
-        seeds: the seed of each replica.
+        stored: the governor of each replica; () for None, with which the first option stays in force.
+        seeds: see `stored_actors`.
     """
-    assert game.governor is not None
+    if not stored:
+        return None
+    assert isinstance(playing, Game)
+    assert playing.governor is not None
     by: Any = stored[0].spec
     if not isinstance(by, Script):
-        (by,) = stored_actors(
-            {game.agents: stored},
-            governor_spaces(game),
-            seeds=lambda agents: seeds,
-            worlds=worlds,
-            stacks=True,
-        ).values()
-    return GovernorActor(game.governor, by)
+        lanes = {playing.agents: stored}
+        actors = stored_actors(lanes, governor_spaces(playing), seeds=seeds, worlds=worlds, stacks=True)
+        (by,) = actors.values()
+    return GovernorActor(playing.governor, by)
 
 
 def decision_values(agents: Mapping[int, Sequence[StoredAgent]]) -> dict[int, list[Tensor]]:

@@ -182,7 +182,9 @@ class Training:
         self._shaped_returns = ShapedReturns(env.batch_size.numel(), spaces.agents, self.learners)
         for learner in self.learners.values():
             learner.begin()
-        all_learners = self.learners if governor is None else {**self.learners, **governor.learners}
+        all_learners = dict(self.learners)
+        if governor is not None and governor.learner is not None:
+            all_learners[governor.learner.agents] = governor.learner
         self.finite = FiniteCheck(all_learners, spaces, worlds=schedule.worlds, on_nan=schedule.on_nan)
         self.observer = Observer(callbacks, env, worlds=schedule.worlds)
         """The caller of the callbacks."""
