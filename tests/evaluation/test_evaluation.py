@@ -15,6 +15,7 @@ import torch
 from matrix_games import prisoners_dilemma
 from PIL import Image
 from places import ROOT
+from random_play import random_agents
 from stored_runs import (
     C51,
     CORRIDORS,
@@ -55,7 +56,7 @@ from cprl.measuring.registry import INCOME_EQUALITY, with_unit
 from cprl.measuring.statistics import estimates
 from cprl.measuring.table import all_metrics, where
 from cprl.networks.mlp import MLPNetwork
-from cprl.policies.actors import LaneActor, random_agents
+from cprl.policies.actors import LaneActor
 from cprl.policies.joint_policy import JointPolicy
 from cprl.population import Frozen, Scripted
 from cprl.runs.checkpoints import Checkpointer

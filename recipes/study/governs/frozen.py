@@ -28,10 +28,10 @@ from cprl.commands.recipe_command import exit_with_message
 from cprl.measuring.playing import evaluate, turns
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY
 from cprl.measuring.table import all_metrics, by_replica, complete, where
-from cprl.policies.actors import LaneActor, random_agents
-from cprl.policies.decisions import stored_decisions
+from cprl.policies.actors import LaneActor
 from cprl.policies.joint_policy import JointPolicy
 from cprl.policies.rng import Purpose
+from cprl.population import Scripted
 from cprl.runs.episodes import read_rows, table_of, write_table
 from cprl.studies.trials import Trial
 from cprl.system.output import say
@@ -84,19 +84,16 @@ def _random_policy(run: LoadedRun) -> JointPolicy:
     """Return what plays the first episode of each world of an evaluation, see `evaluate_population`; of it,
     agents see in their first turn what was voted for."""
     experiment = run.experiment
-    count = experiment.replicas
-    worlds = experiment.evaluation_episodes
-    everyone = tuple(range(run.game.agents))
-    decisions = stored_decisions(
-        run.game,
-        {},
-        replicas=range(count),
-        worlds=worlds,
+    agents = [[StoredAgent(spec=Scripted("random"))] * experiment.replicas] * run.game.agents
+    return stored_policies(
+        agents,
+        run.playing,
+        replicas=range(experiment.replicas),
+        worlds=experiment.evaluation_episodes,
         seed=experiment.seed,
         purpose=Purpose.RANDOM_PLAY,
+        decides=Purpose.RANDOM_PLAY,
     )
-    actors = random_agents(run.spaces, everyone, replicas=count, seed=experiment.seed, worlds=worlds)
-    return JointPolicy(actors, decisions=decisions)
 
 
 def rows_of(trial: Trial, table: pa.Table, exploration: float) -> pa.Table:

@@ -9,12 +9,11 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from cprl import recurrent_state
-from cprl.commons.spaces import Spaces
-from cprl.policies.rng import LaneRng, Purpose, lane_seeds
+from cprl.policies.rng import LaneRng
 from cprl.system.compiling import Compiled
 
 
@@ -204,15 +203,6 @@ class LaneActor(ActorOfLanes):
         """Reshape [R x k, S, ...] to [L, k, ...]."""
         by_lane = values.view(self.replicas, self.worlds, *values.shape[1:]).transpose(1, 2)
         return by_lane.reshape(-1, *by_lane.shape[2:])
-
-
-def random_agents(
-    spaces: Spaces, agents: tuple[int, ...], *, replicas: int, seed: int, worlds: int = 1
-) -> dict[int | tuple[int, ...], nn.Module]:
-    """Return one uniformly random actor for some agents of every replica, as `JointPolicy` takes actors: by
-    the indices of its agents."""
-    seeds = lane_seeds(seed, replicas=range(replicas), agents=agents, purpose=Purpose.RANDOM_PLAY)
-    return {agents: LaneActor(None, spaces.actions, seeds=seeds, agents=len(agents), worlds=worlds)}
 
 
 class RandomActor(TensorDictModuleBase):

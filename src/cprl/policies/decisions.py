@@ -60,10 +60,10 @@ class Decider(nn.Module):
         agents: the number of agents N.
         worlds: the number of worlds k of each replica, consecutive in the batch.
         values: float64 [R, N, C], the values of the C choices of all ballots, ballot after ballot; `UNTRIED`
-            for a choice that was never made. Not copied, so that the decider follows what is learned. None
-            for agents that all choose at random.
-        epsilon: float64 [R, N], 0..1, not copied either; None for 0.
-        by_chance: bool [N], marks agents that always choose at random; None for no agent.
+            for a choice that was never made. Not copied, so that the decider follows what is learned.
+        by_chance: bool [N], marks agents that always choose at random.
+
+    `epsilon`, float64 [R, N], initially 0, is the probability of a random choice of each agent.
     """
 
     def __init__(
@@ -73,9 +73,8 @@ class Decider(nn.Module):
         seeds: Sequence[Sequence[int]],
         agents: int,
         worlds: int = 1,
-        values: Float64 | None = None,
-        epsilon: Float64 | None = None,
-        by_chance: Sequence[bool] | None = None,
+        values: Float64,
+        by_chance: Sequence[bool],
     ) -> None:
         super().__init__()
         self.sizes = tuple(sizes)
@@ -83,12 +82,9 @@ class Decider(nn.Module):
         self.worlds = worlds
         self.replicas = len(seeds) // agents
         self._seeds = [tuple(seed) for seed in seeds]
-        size = self.replicas, self.agents
-        self.values = np.zeros((*size, sum(self.sizes))) if values is None else values
-        self.epsilon = np.zeros(size) if epsilon is None else epsilon
-        self.by_chance = np.full(self.agents, values is None)
-        if by_chance is not None:
-            self.by_chance |= np.array(by_chance, np.bool_)
+        self.values = values
+        self.epsilon = np.zeros((self.replicas, self.agents))
+        self.by_chance = np.array(by_chance, np.bool_)
         batch = self.replicas * self.worlds
         self._choices = np.zeros((batch, self.agents, len(self.sizes)), np.int64)
         """The latest choice of each agent of each world on each ballot, [R x k, N, V]."""
@@ -238,7 +234,6 @@ class BanditDecider(Decider):
             agents=agents,
             worlds=worlds,
             values=_new_values(sizes, stored, replicas=replicas, agents=agents),
-            epsilon=np.zeros((replicas, agents)),
             by_chance=[bandit is None and agent not in stored for agent, bandit in enumerate(bandits)],
         )
         self.bandits = tuple(bandits)

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from cprl import recurrent_state
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.rng import LaneRng, lane_name
-from cprl.population import OwnPast, Pool
+from cprl.population import OwnPast
 from cprl.system.compat.tensordicts import unchecked_tensordict
 
 
@@ -46,19 +46,16 @@ class PoolActor(nn.Module):
         self._make_actors = make_actors
         self._seeds = seeds
         self._worlds = worlds
-        spec: Pool = pools[0].spec
-        self._draws_newest = spec.draw == "newest"
+        self._spec: Any = pools[0].spec
         self._present: Any = present
-        self._own_past = None
         self._all: list[Sequence[Any]] = list(zip(*[pool.pool for pool in pools], strict=True))
         """The opponents, oldest first, each as an agent of each replica."""
         self._first_past = len(self._all)
         self._held = 0
-        if present is not None and spec.own_past is not None:
-            self._own_past = spec.own_past
+        if present is not None and self._spec.own_past is not None:
             # One more than can be drawn, so that the last one to leave ends its episodes.
-            self._held = spec.own_past.kept + 1
-            self._all += [present(spec.own_past) for _ in range(self._held)]
+            self._held = self._spec.own_past.kept + 1
+            self._all += [present(self._spec.own_past) for _ in range(self._held)]
         self._copies = min(self._held, 1)
         """The past selves so far; number n has the index `_first_past` + n % `_held`."""
         self._steps = 0
@@ -117,15 +114,15 @@ class PoolActor(nn.Module):
         """Return the index of each world's opponent, int64 [B], drawn anew where it is -1 or has left."""
         drawable = torch.tensor(self._drawable, device=index.device)
         position = (self.rng.next().flatten() * len(drawable)).long().to(index.device)
-        drawn = drawable[-1] if self._draws_newest else drawable[position]
+        drawn = drawable[position] if self._spec.draw == "uniform" else drawable[-1]
         return torch.where((index < 0) | (index == left), drawn, index)
 
     def _copy_if_due(self) -> int:
         """Copy the agent as it is now; return the index of what left for it, -1 for nothing."""
         left = -1
-        if self._own_past and self._steps >= self._copies * self._own_past.every_steps:
+        if self._held and self._steps >= self._copies * self._spec.own_past.every_steps:
             left = self._first_past + self._copies % self._held
-            self._all[left] = self._present(self._own_past)
+            self._all[left] = self._present(self._spec.own_past)
             self._copies += 1
             self.policy = self._make_policy()
         self._steps += self._worlds
