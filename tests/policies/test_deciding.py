@@ -160,15 +160,16 @@ def test_exploration_decays_with_the_episodes_of_each_replica():
 
 
 def test_the_best_choice_is_taken_and_of_equal_ones_the_first():
-    values = np.array([[[2.0, 2.0, 1.0, 5.0, 5.0], [UNTRIED, -3.0, UNTRIED, UNTRIED, UNTRIED]]])
-    decider = Decider((2, 3), seeds=[(0,), (1,)], agents=2, values=values, by_chance=[False] * 2)
+    values = torch.tensor([[2.0, 2.0, 1.0, 5.0, 5.0], [UNTRIED, -3.0, UNTRIED, UNTRIED, UNTRIED]])
+    stored = {0: values[:1], 1: values[1:]}
+    decider = Decider((2, 3), seeds=[(0,), (1,)], agents=2, stored=stored)
     # Agent 0: choices 0 and 1, so 0 + 2 x 1; agent 1: choices 1 and, of three that it never made, 0.
     assert decider.decide(due((True, True))).tolist() == [[2, 1]]
 
 
 def test_agents_choose_anew_only_on_the_ballots_that_are_due():
-    values = np.array([[[0.0, 1, 0, 0, 1]]])
-    decider = Decider((2, 3), seeds=[(0,)], agents=1, worlds=2, values=values, by_chance=[False])
+    stored = {0: torch.tensor([[0.0, 1, 0, 0, 1]])}
+    decider = Decider((2, 3), seeds=[(0,)], agents=1, worlds=2, stored=stored)
     assert decider.decide(due((True, False), (False, True))).tolist() == [[1], [4]]
     before = decider.decide(due((False, False), (False, False)))
     decider.values[0, 0] = [1, 0, 1, 0, 0]
@@ -178,9 +179,7 @@ def test_agents_choose_anew_only_on_the_ballots_that_are_due():
 
 
 def test_agents_by_chance_make_every_choice_equally_often_whatever_the_exploration():
-    seeds = [(0,), (1,)]
-    values = np.zeros((1, 2, 5))
-    decider = Decider((2, 3), seeds=seeds, agents=2, worlds=3000, values=values, by_chance=[True] * 2)
+    decider = Decider((2, 3), seeds=[(0,), (1,)], agents=2, worlds=3000, stored={})
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         found = decider.decide(torch.ones(3000, 2, dtype=torch.bool))
     for agent in range(2):
@@ -324,8 +323,8 @@ def test_a_person_who_decides_is_heard():
     rates = set()
     for decision in (0, 1):
         env.set_seed(1)
-        values = np.array([[[0.0, 1.0], [1.0, 0.0], [0.0, 0.0]]])
-        decider = Decider((2,), seeds=[(0,)] * 3, agents=3, values=values, by_chance=[False] * 3)
+        stored = dict(enumerate(torch.tensor([[[0.0, 1.0]], [[1.0, 0.0]], [[0.0, 0.0]]])))
+        decider = Decider((2,), seeds=[(0,)] * 3, agents=3, stored=stored)
         others = JointPolicy(by_chance(), decisions=decider)
         session = Session(env, others, agent=2, decision=decision)
         session.act("stay")
@@ -407,7 +406,7 @@ def test_decisions_are_learned_from_what_an_agent_wants():
 def test_decisions_are_given_where_they_are_asked_for_and_nowhere_else():
     with pytest.raises(ValueError, match=r"Bandit.step_size is 0"):
         Bandit(step_size=0)
-    decider = Decider((3,), seeds=[(0,)], agents=1, values=np.zeros((1, 1, 3)), by_chance=[True])
+    decider = Decider((3,), seeds=[(0,)], agents=1, stored={})
     with pytest.raises(ValueError, match="3 actors, and decisions of 1 agents"):
         JointPolicy(by_chance(), decisions=decider)
     env = make_env(MEADOW, worlds=1)

@@ -302,7 +302,7 @@ class Population:
         return partial(lane_seeds, self.seed, replicas=numbers, purpose=purpose)
 
     def _make_decider(self) -> BanditDecider | None:
-        sizes = () if self._game is None else ballot_sizes(self._game)
+        sizes = ballot_sizes(self._game)
         refuse_undecided(self.specs, len(sizes))
         if not sizes:
             return None

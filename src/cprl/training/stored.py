@@ -24,7 +24,7 @@ from cprl.networks.recurrent import state_cells_of
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.actors import LaneActor
 from cprl.policies.asking import CALLS, Calls
-from cprl.policies.decisions import ballot_sizes, stored_decisions
+from cprl.policies.decisions import Decider, ballot_sizes
 from cprl.policies.governors import GovernorActor, Script, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
@@ -228,7 +228,7 @@ class LoadedRun:
         return [StoredAgent(spec=learner, network=network) for network in networks[-spec.own_past.kept :]]
 
     def _decisions_of(self, lane: str) -> Tensor | None:
-        sizes = ballot_sizes(self.game) if isinstance(self.game, Game) else ()
+        sizes = ballot_sizes(self.game)
         values = self.decisions.get(lane)
         if not sizes:
             return None
@@ -391,10 +391,13 @@ def stored_policies(
     seeds = partial(lane_seeds, seed, replicas=replicas, purpose=purpose)
     governor = stored_governor(by_index.pop(playing.agents, ()), playing, seeds=seeds, worlds=worlds)
     decisions = None
-    if isinstance(playing, Game):
-        stored = decision_values(by_index)
-        decisions = stored_decisions(
-            playing, stored, replicas=replicas, worlds=worlds, seed=seed, purpose=decides
+    if sizes := ballot_sizes(playing):
+        decisions = Decider(
+            sizes,
+            seeds=lane_seeds(seed, replicas=replicas, agents=range(playing.agents), purpose=decides),
+            agents=playing.agents,
+            worlds=worlds,
+            stored=decision_values(by_index),
         )
     actors = stored_actors(by_index, playing, seeds=seeds, worlds=worlds, stacks=True)
     return JointPolicy(actors, decisions=decisions, governor=governor)
