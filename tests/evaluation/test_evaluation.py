@@ -15,7 +15,7 @@ import torch
 from matrix_games import prisoners_dilemma
 from PIL import Image
 from places import ROOT
-from random_play import random_agents
+from random_agents import random_agents
 from stored_runs import (
     C51,
     CORRIDORS,

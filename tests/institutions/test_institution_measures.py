@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
-from random_play import random_agents
+from random_agents import random_agents
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 from written_episodes import all_written_out, turn

@@ -10,7 +10,7 @@ from drawings import frames_of
 from matplotlib.image import imread
 from paying_game import Charges
 from places import ROOT
-from random_play import random_agents
+from random_agents import random_agents
 from recordings import column, names, static
 from rerun.chunk import RrdReader
 from rich.console import Console

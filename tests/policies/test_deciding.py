@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, strategies as st
-from random_play import random_agents
+from random_agents import random_agents
 from stock_collector import stock_collector
 from stored_runs import episodes_of
 from torchrl.envs.utils import ExplorationType, set_exploration_type

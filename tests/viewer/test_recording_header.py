@@ -12,7 +12,7 @@ import rerun as rr
 import torch
 from live_viewers import connected, fake, received
 from matrix_games import MatrixGame, chicken, matching_pennies, prisoners_dilemma, stag_hunt
-from random_play import random_agents
+from random_agents import random_agents
 from recordings import GAME, SCENE, column, headers, names, observing, static, texts
 from rerun.chunk import RrdReader
 from tensordict import TensorDict

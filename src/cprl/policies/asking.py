@@ -86,9 +86,9 @@ class Question(NamedTuple):
     system: str
     prompt: str
 
-    def request(self, model: Model) -> dict[str, Any]:
-        """Return the body of the request."""
-        return {
+    def new_call(self, model: Model) -> dict[str, Any]:
+        """Return what is kept of a call before it is made: the hash of its request, its name, its request."""
+        request = {
             "model": model.model,
             "messages": [
                 {"role": "system", "content": self.system},
@@ -99,6 +99,7 @@ class Question(NamedTuple):
             "seed": self.seed,
             "response_format": {"type": "json_object"},
         }
+        return {"hash": _hash(request), "call": self.call, "request": request}
 
 
 class Calls:
@@ -132,23 +133,21 @@ class Calls:
             ValueError: if `Model.stored` lacks a call.
             ConnectionError: if the first call of all fails in a way that a retry cannot change.
         """
-        hashes = [_hash(question.request(model)) for question in questions]
-        by_hash = dict(zip(hashes, questions, strict=True))
-        new = [by_hash[name] for name in by_hash if name not in self.kept]
+        calls = [question.new_call(model) for question in questions]
+        new = {call["hash"]: call for call in calls if call["hash"] not in self.kept}
         self._most = model.max_calls
         if model.stored is not None:
-            for question in new:
-                self._keep(self._stored_call(model, question))
+            for call in new.values():
+                self._keep(self._stored_call(model.stored, call))
         else:
             left = model.max_calls - self._made
             most_tries = [1 + model.retries if index < left else 0 for index in range(len(new))]
             with ThreadPoolExecutor(model.concurrency) as pool:
-                list(pool.map(partial(self._make, model, read), new, most_tries))
-        return [_understood(self.kept[name]["answer"], read)[0] for name in hashes]
+                list(pool.map(partial(self._make, model, read), new.values(), most_tries))
+        return [_understood(self.kept[call["hash"]]["answer"], read)[0] for call in calls]
 
-    def _make(self, model: Model, read: Callable[[Any], Any], question: Question, most_tries: int) -> None:
+    def _make(self, model: Model, read: Callable[[Any], Any], call: dict[str, Any], most_tries: int) -> None:
         """Make a call, and keep what came of it."""
-        request = question.request(model)
         began = time.monotonic()
         tries = 0
         outcome = _Outcome(None, OVER_LIMIT)
@@ -156,7 +155,7 @@ class Calls:
             if tries:
                 time.sleep(model.backoff_s * 2 ** (tries - 1))
             tries += 1
-            outcome = _post(model, request)
+            outcome = _post(model, call["request"])
             if not outcome.may_retry:
                 break
         # a list, since other threads keep calls meanwhile
@@ -165,9 +164,7 @@ class Calls:
         prompt_price, answer_price = model.prices or (0.0, 0.0)
         self._keep(
             {
-                "hash": _hash(request),
-                "call": question.call,
-                "request": request,
+                **call,
                 "answer": outcome.answer,
                 "failure": outcome.failure or _understood(outcome.answer, read)[1],
                 "tries": tries,
@@ -179,17 +176,15 @@ class Calls:
             }
         )
 
-    def _stored_call(self, model: Model, question: Question) -> dict[str, Any]:
-        """Return a call of another run; refuse one that it does not keep."""
-        path = Path(str(model.stored)) / CALLS
+    def _stored_call(self, run: str, call: dict[str, Any]) -> dict[str, Any]:
+        """Return a call as another run keeps it; refuse one that it does not keep."""
+        path = Path(run) / CALLS
         if path not in self._stored:
             self._stored[path] = read_calls(path)
         stored = self._stored[path]
-        request = question.request(model)
-        if _hash(request) not in stored:
-            differs = _differs(stored, question.call, request)
-            raise ValueError(f"{path} keeps no answer for {question.call}: {differs}")
-        return stored[_hash(request)]
+        if call["hash"] not in stored:
+            raise ValueError(f"{path} keeps no answer for {call['call']}: {_differs(stored, call)}")
+        return stored[call["hash"]]
 
     def _keep(self, call: dict[str, Any]) -> None:
         with self._lock:
@@ -309,10 +304,11 @@ def _understood(answer: str | None, read: Callable[[Any], T]) -> tuple[T | None,
         return None, str(error)
 
 
-def _differs(stored: dict[str, dict[str, Any]], name: str, request: dict[str, Any]) -> str:
-    """Return what differs between a request and the stored one of the same name."""
-    for call in stored.values():
-        if call["call"] == name:
-            changed = [part for part in request if request[part] != call["request"].get(part)]
+def _differs(stored: dict[str, dict[str, Any]], call: dict[str, Any]) -> str:
+    """Return what differs between a call and the stored one of the same name."""
+    request = call["request"]
+    for earlier in stored.values():
+        if earlier["call"] == call["call"]:
+            changed = [part for part in request if request[part] != earlier["request"].get(part)]
             return f"it keeps one with another {' and '.join(changed)}"
     return "it keeps none of that name"
