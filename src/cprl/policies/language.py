@@ -268,9 +268,8 @@ class LanguageActor(TensorDictModuleBase):
             self._answers = _PlainActions(playing, self.script)
         self._system = "\n".join(filter(None, (spec.instructions, self._answers.rules(spec))))
         self._calls = calls
-        self._seeds = [tuple(seed) for seed in seeds]
-        self._numbers = [seed[2] for seed in self._seeds[:agents]]
-        """The indices of the S agents in the game."""
+        self._seeds = seeds
+        """Of each lane: the seed of the run, the replica, the agent, and the purpose, see `lane_seeds`."""
         self._said = {} if said is None else said
         self._asked = np.zeros((len(seeds), worlds), np.int64)
         """How often each lane has asked in each world."""
@@ -281,7 +280,7 @@ class LanguageActor(TensorDictModuleBase):
         observation = tensordict.get("observation")
         memory = tensordict.get(recurrent_state.AFTER).numpy(force=True).copy()
         for world, index in np.argwhere(memory[..., _TURN] == 0).tolist():
-            self._said[world, self._numbers[index]] = []
+            self._said[world, self._seeds[index][2]] = []
         due = (memory[..., _NEXT] <= memory[..., _TURN]) & ~tensordict.get(keys.DONE).numpy(force=True)
         if isinstance(self._answers, _BoardPlans):
             memory[..., _HARVEST] += tensordict.get(keys.HARVEST[1]).numpy(force=True)
@@ -305,7 +304,7 @@ class LanguageActor(TensorDictModuleBase):
             plan, message = answer or (self._answers.fallback, "")
             memory[world, index, _PLAN:] = plan
             if message:
-                self._said[world, self._numbers[index]].append((int(memory[world, index, _TURN]), message))
+                self._said[world, self._seeds[index][2]].append((int(memory[world, index, _TURN]), message))
 
     def _read(self, table: Any) -> tuple[tuple[int, ...], str]:
         """Return the numbers of a plan, and a message; raise a ValueError if they are not allowed."""
