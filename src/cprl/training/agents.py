@@ -13,7 +13,7 @@ from cprl.algorithms.base import Algorithm, TeamAlgorithm, TrainingEngine
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import spaces_of
-from cprl.envs.unwrap import agent_names, commons_of
+from cprl.envs.unwrap import agent_names, commons_game_of
 from cprl.learners.lanes import Lanes
 from cprl.learners.protocol import AnyLearner
 from cprl.measuring.registry import OPTIONAL_ENTRIES, reported_by
@@ -37,6 +37,7 @@ from cprl.population import (
     Pool,
     Scripted,
     Team,
+    algorithm_name,
     grouped,
     refuse_people,
     refuse_sharing,
@@ -56,13 +57,13 @@ from cprl.training.stored import (
     stored_governor,
     stored_policies,
 )
-from cprl.values import Custom, instantiate, short_repr
+from cprl.values import instantiate, short_repr
 
 
-def _refuse_only_in_play(spec: Learning | Team, env: EnvBase) -> None:
+def _refuse_only_in_play(learner: AnyLearner, env: EnvBase) -> None:
     """Raise a ValueError for `only_in_play` in a game without the entry "in_play"."""
-    settings = getattr(_algorithm_of(spec), "settings", None)
-    if getattr(settings, "only_in_play", False) and keys.IN_PLAY not in env.observation_spec.keys(True, True):
+    has_in_play = keys.IN_PLAY in env.observation_spec.keys(True, True)
+    if getattr(learner.settings, "only_in_play", False) and not has_in_play:
         raise ValueError(
             'settings.only_in_play is True; allowed in a game without the entry ("agents", "in_play"): False'
         )
@@ -112,8 +113,7 @@ class Population:
         self.seed = seed
         self.worlds = worlds
         self.replicas = env.batch_size.numel() // worlds
-        commons = commons_of(env)
-        self._game = None if commons is None else commons.game
+        self._game = commons_game_of(env)
         self.device = env.device or torch.device("cpu")
         groups = grouped(specs, self.spaces.agents)
         self._specs_by_agent: list[AgentSpec | GovernorSpec] = [*specs_by_agent(specs, self.spaces.agents)]
@@ -126,8 +126,8 @@ class Population:
         self.learners: dict[tuple[int, ...], AnyLearner] = {}
         for spec, agents in groups:
             if isinstance(spec, Learning | Team):
-                _refuse_only_in_play(spec, env)
                 self.learners[agents] = self._make_learner(spec, agents, engine, self.spaces, starts=starts)
+                _refuse_only_in_play(self.learners[agents], env)
         self._stored_agents = self._load_stored_agents(weights or {})
         self._pools = {
             agent: PoolActor(
@@ -345,7 +345,7 @@ class Population:
         learner = _algorithm_of(spec).make_learner(lanes, engine)
         if learner.rewards.reward != spec.reward and not isinstance(spec.reward, str):
             raise ValueError(
-                f"reward is {reward_name(spec.reward)}, which the learner of {_algorithm_name(spec)} does "
+                f"reward is {reward_name(spec.reward)}, which the learner of {algorithm_name(spec)} does "
                 "not have as its `rewards`; allowed for it: 'individual', 'team'"
             )
         return learner
@@ -396,7 +396,7 @@ def refuse_other_worlds(earlier: EnvBase, env: EnvBase, name: str, others: Itera
     Args:
         others: the actors of the agents that do not learn; scripted ones go by rules of `env`.
     """
-    games = [None if commons is None else commons.game for commons in map(commons_of, (earlier, env))]
+    games = commons_game_of(earlier), commons_game_of(env)
     pairs: dict[str, tuple[Any, Any]] = {"agents": (agent_names(earlier), agent_names(env))}
     pairs["a board of cprl:"] = games[0] is not None, games[1] is not None
     reported = [reported_by(worlds) for worlds in (earlier, env)]
@@ -536,12 +536,8 @@ def _algorithm_of(spec: Learning | Team) -> Algorithm:
     algorithm = instantiate(spec.algorithm)
     if not isinstance(algorithm, kind):
         raise ValueError(
-            f"the algorithm of {_algorithm_name(spec)} is a {type(algorithm).__name__}; allowed: a subclass "
+            f"the algorithm of {algorithm_name(spec)} is a {type(algorithm).__name__}; allowed: a subclass "
             f"of cprl.algorithms.{kind.__name__}"
         )
     refuse_sharing(algorithm, is_sharing)
     return algorithm
-
-
-def _algorithm_name(spec: Learning | Team) -> str:
-    return spec.algorithm.target if isinstance(spec.algorithm, Custom) else type(spec.algorithm).__name__
