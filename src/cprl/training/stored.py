@@ -430,10 +430,11 @@ def stored_governor(
 
 def decision_values(agents: Mapping[int, Sequence[StoredAgent]]) -> dict[int, list[Tensor]]:
     """Return the values of the decisions of agents that have any, in each replica."""
-    values: dict[int, list[Any]] = {
-        agent: [stored.decisions for stored in replicas] for agent, replicas in agents.items()
-    }
-    return {agent: decisions for agent, decisions in values.items() if decisions[0] is not None}
+    values: dict[int, list[Any]] = {}
+    for agent, replicas in agents.items():
+        if replicas[0].decisions is not None:
+            values[agent] = [stored.decisions for stored in replicas]
+    return values
 
 
 def stored_actors(
