@@ -80,7 +80,7 @@ class Decider(nn.Module):
         self.agents = agents
         self.worlds = worlds
         self.replicas = len(seeds) // agents
-        self._seeds = [tuple(seed) for seed in seeds]
+        self._seeds = seeds
         self.values = np.full((self.replicas, agents, sum(self.sizes)), UNTRIED)
         for agent, values in stored.items():
             self.values[:, agent] = torch.stack(list(values)).numpy(force=True)
