@@ -22,7 +22,7 @@ from cprl.envs.env_state import env_state, load_env_state, load_transforms_state
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.unwrap import commons_game_of
 from cprl.keys import Turn
-from cprl.learners.protocol import AnyLearner
+from cprl.learners.learner import Learner
 from cprl.measuring.series import Observer
 from cprl.measuring.tracker import Episode, example_episode, tracker_of, with_missing
 from cprl.policies.decisions import Decider
@@ -126,7 +126,7 @@ class Training:
     def __init__(
         self,
         env: EnvBase,
-        learners: Mapping[tuple[int, ...], AnyLearner],
+        learners: Mapping[tuple[int, ...], Learner],
         schedule: Schedule,
         *,
         others: Mapping[ActorAgents, nn.Module] | None = None,
@@ -465,7 +465,7 @@ def _states(parts: Sequence[Any]) -> list[dict[str, Any]]:
 
 def train(
     env: EnvBase,
-    learners: Mapping[tuple[int, ...], AnyLearner],
+    learners: Mapping[tuple[int, ...], Learner],
     schedule: Schedule,
     *,
     others: Mapping[ActorAgents, nn.Module] | None = None,
