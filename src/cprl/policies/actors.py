@@ -86,9 +86,8 @@ class LaneActor(ActorOfLanes):
         states = (recurrent_state.AFTER,) if self.state_cells else ()
         self.in_keys = ("observation", *states)
         self.out_keys = ("action", *states)
-        self._epsilon = 0.0 if stochastic else 1.0
         # A tensor, because compiled code treats other numbers as constants.
-        self._epsilon_tensor = torch.tensor(self._epsilon, dtype=torch.float64)
+        self._epsilon = torch.tensor(0.0 if stochastic else 1.0, dtype=torch.float64)
         # Two functions instead of one with *inputs: compiled code that is shared needs named arguments.
         explore = LaneActor._explore_recurrent if self.state_cells else LaneActor._explore
         self._compiled_explore = Compiled(explore, what="agents act", enabled=compile)
@@ -96,7 +95,7 @@ class LaneActor(ActorOfLanes):
     @property
     def epsilon(self) -> float:
         """Return the probability of a random action, 0..1."""
-        return self._epsilon
+        return float(self._epsilon)
 
     @epsilon.setter
     def epsilon(self, epsilon: float) -> None:
@@ -104,9 +103,8 @@ class LaneActor(ActorOfLanes):
 
     def explore_with(self, epsilon: float) -> None:
         """Set `epsilon` if agents have one; faster than setting an attribute of a module."""
-        if epsilon != self._epsilon and not self.stochastic:
-            self._epsilon_tensor.fill_(epsilon)
-            object.__setattr__(self, "_epsilon", float(epsilon))
+        if not self.stochastic:
+            self._epsilon.fill_(epsilon)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         chosen = self.choose_with(*(tensordict.get(name) for name in self.in_keys))
@@ -134,7 +132,7 @@ class LaneActor(ActorOfLanes):
             return [self._by_replica(values.argmax(-1)), *states_after]
         form = tuple((entry.shape, entry.dtype) for entry in inputs)
         numbers = self._draw_numbers(device)
-        return self._compiled_explore(form, self, numbers, self._epsilon_tensor.to(device), *inputs)
+        return self._compiled_explore(form, self, numbers, self._epsilon.to(device), *inputs)
 
     def _explore(self, numbers: Tensor, epsilon: Tensor, observation: Tensor) -> list[Tensor]:
         """Return exploring actions, [R x k, S]."""
