@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cprl import keys, recurrent_state
+from cprl import keys
 from cprl.commons.spaces import Spaces
-from cprl.keys import Turn
+from cprl.keys import Turn, recurrent_state
 from cprl.learners.transitions import LaneTurn, TransitionForm, joint_actions_by_agent
 from cprl.objectives.rewards import Reward, check_reward
 from cprl.policies.rng import Purpose, lane_names, lane_seeds

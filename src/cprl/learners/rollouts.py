@@ -9,8 +9,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from cprl import recurrent_state
-from cprl.keys import Turn
+from cprl.keys import Turn, recurrent_state
 from cprl.learners.draw import Draw
 from cprl.learners.lanes import Lanes
 from cprl.learners.networks import LaneNetworks

@@ -12,7 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl import recurrent_state
+from cprl.keys import recurrent_state
 from cprl.policies.rng import LaneRng
 from cprl.system.compiling import Compiled
 

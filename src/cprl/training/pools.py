@@ -8,7 +8,7 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor, nn
 
-from cprl import recurrent_state
+from cprl.keys import recurrent_state
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.rng import LaneRng, lane_name
 from cprl.population import OwnPast
