@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -57,7 +57,7 @@ from cprl.training.stored import (
     stored_governor,
     stored_policies,
 )
-from cprl.values import instantiate, short_repr
+from cprl.values import checked, instantiate
 
 
 def _refuse_only_in_play(learner: Learner, env: EnvBase) -> None:
@@ -78,7 +78,8 @@ class Population:
         seed: the seed of the run; each agent of each replica has its own random numbers.
         worlds: the worlds W of each replica; world b of `env` belongs to replica b // W.
         first_replica: the number of the first replica, so that replica r can be trained alone.
-        engine: "compiled", "eager" or "torchrl", see `Experiment.engine`.
+        engine: "compiled", "eager" or "torchrl", see `Experiment.engine`; "auto" is for an experiment, which
+            says how long it trains.
         starts: whether agents with `start_from` get the stored weights; False if a checkpoint with later
             weights is loaded next.
         weights: the names of the weights of `Frozen` agents by run, see `cprl.load`; runs not in it have
@@ -95,18 +96,13 @@ class Population:
         seed: int = 0,
         worlds: int = 1,
         first_replica: int = 0,
-        engine: str = "compiled",
+        engine: TrainingEngine = "compiled",
         starts: bool = True,
         weights: Mapping[str, str] | None = None,
         governor: GovernorSpec | None = None,
         governor_from_turn: int = 0,
     ) -> None:
-        known = get_args(TrainingEngine)
-        if engine not in known:
-            more = '; "auto" is for an Experiment, which says how long it trains' * (engine == "auto")
-            raise ValueError(
-                f"engine is {short_repr(engine)}; allowed: {', '.join(map(short_repr, known))}{more}"
-            )
+        checked("engine", engine, TrainingEngine)
         refuse_people(specs)
         self.spaces = spaces_of(env)
         self.specs = tuple(specs)
