@@ -4,14 +4,13 @@ The rules of a turn are plain Python functions, each about one world. Numba comp
 GPU, where a loop calls them for each of B worlds.
 
 Letters, here and in shapes of arrays: B worlds, N agents, K sites (cells where apples grow), H x W cells of
-the board, and C channels of an observation of X rows and Y columns. In the rules, i and j are agents and k is
-a site.
+the board, and C channels of an observation of X rows and Y columns.
 
 Modules in reading order. How a game is described:
 
     rules        Rules: every number of the game, with unit, range and source
     maps         Map: boards that are drawn, known by name, or generated
-    published    the published games by name: boards with their rules
+    named_games  the published games and those of the literature by name
     literature   the games of other programs and papers by name
     spaces       Spaces: the shapes of observations and the number of actions
     observation  Observation: the form in which agents observe the game

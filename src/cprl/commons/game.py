@@ -84,7 +84,7 @@ class Game(Value):
     @property
     def agent_names(self) -> tuple[str, ...]:
         """Return agent_0, agent_1, ..., one name for each agent."""
-        return tuple(f"agent_{i}" for i in range(self.agents))
+        return tuple(f"agent_{agent}" for agent in range(self.agents))
 
     @property
     def actions(self) -> tuple[str, ...]:
@@ -184,7 +184,7 @@ class Game(Value):
     @property
     def in_force(self) -> tuple[Ballot, ...]:
         """Return all that is decided: the ballots, and last what a governor sets."""
-        return self.ballots if self.governor is None else (*self.ballots, self.governor.decided)
+        return self.ballots if self.governor is None else (*self.ballots, self.governor.controlled)
 
     @property
     def decisions(self) -> int:

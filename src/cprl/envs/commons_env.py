@@ -144,14 +144,13 @@ class CommonsEnv(LeanStepEnv):
             for name, count in choice_counts.items()
         }
         rules = {}
-        if game.governor is not None:
-            options = len(game.governor.options)
-            rules[keys.RULE] = Categorical(options, shape=(self._world_count,), dtype=torch.int64)
-        self.action_spec = self._group_spec(choices, **rules)
         root_specs = self._entry_specs(self._world_entries)
         if game.governor is not None:
-            seen = self._world_count, len(game.governor.sees)
-            root_specs[keys.SEEN] = Unbounded(shape=seen, dtype=torch.float32)
+            options = len(game.governor.options)
+            rules[keys.RULE] = Categorical(options, shape=self.batch_size, dtype=torch.int64)
+            features = len(game.governor.sees)
+            root_specs[keys.SEEN] = Unbounded(shape=(*self.batch_size, features), dtype=torch.float32)
+        self.action_spec = self._group_spec(choices, **rules)
         if self._has_state:
             board = self._world_count, 3, game.map.height, game.map.width
             root_specs[keys.STATE] = Bounded(0, 255, shape=board, dtype=torch.uint8)
@@ -228,7 +227,7 @@ class CommonsEnv(LeanStepEnv):
             agents["reward"] = reward
         entries: dict[str, Any] = {name: tensors[name] for name in (*self._world_entries, *_DONE_ENTRIES)}
         if self.game.governor is not None:
-            entries[keys.SEEN] = torch.as_tensor(self.worlds.seen(), device=self.device)
+            entries[keys.SEEN] = torch.as_tensor(self.worlds.governor_features(), device=self.device)
         if self._has_state:
             boards = torch.as_tensor(self.worlds.boards(), device=self.device)
             entries[keys.STATE] = self._colours[boards.long()].permute(0, 3, 1, 2)
@@ -293,6 +292,9 @@ class CommonsEnv(LeanStepEnv):
 
         Returns:
             A numpy array in RGB: uint8 [rows, columns, 3] for one world, uint8 [B, rows, columns, 3] for all.
+
+        Raises:
+            ValueError: before the first reset, or for a world that the environment does not have.
         """
         batch = self.worlds
         if not batch.has_begun:

@@ -3,6 +3,7 @@
 from torchrl.envs import EnvBase, TransformedEnv
 
 from cprl import keys
+from cprl.commons.game import Game
 from cprl.envs.commons_env import CommonsEnv
 
 
@@ -19,6 +20,12 @@ def commons_of(env: EnvBase) -> CommonsEnv | None:
     return base if isinstance(base, CommonsEnv) else None
 
 
+def commons_game_of(env: EnvBase) -> Game | None:
+    """Return the `cprl.Game` that an environment plays, or None for another game."""
+    commons = commons_of(env)
+    return None if commons is None else commons.game
+
+
 def clock_of(env: EnvBase) -> int | None:
     """Return the largest number of turns in an episode of an environment; None for a game without limit."""
     return clock_in(getattr(base_env(env), "game", None))
@@ -30,7 +37,11 @@ def clock_in(game: object) -> int | None:
 
 
 def agent_count(env: EnvBase) -> int:
-    """Return the number of agents N, read from the shape of ("agents", "reward"), [B, N, 1]."""
+    """Return the number of agents N, read from the shape of ("agents", "reward"), [B, N, 1].
+
+    Raises:
+        ValueError: if the batch size is not [B], or the reward is missing or has another shape.
+    """
     size = tuple(env.batch_size)
     if len(size) != 1:
         raise ValueError(f"the environment has batch size {list(size)}; allowed: [B], B worlds")

@@ -23,11 +23,12 @@ class Ballot(NamedTuple):
     """The thing to decide, in words."""
     choices: tuple[float, ...]
     """The values to choose from; in an election the indices of agents."""
-    is_election: bool
+    is_election: bool = False
     """Whether the choice with most votes wins; otherwise the median of the decisions does."""
-    period_episodes: int
-    """The ballot is held at the first of every such number of episodes; 0 for what a governor sets."""
-    override_prob: float
+    period_episodes: int = 0
+    """The ballot is held at the first of every such number of episodes; 0 for what a governor sets, on which
+    no agent votes."""
+    override_prob: float = 0.0
     """The probability that the result is drawn by chance, whatever agents decide."""
 
 
@@ -43,9 +44,9 @@ class Institution(Value, stored=False):
     """Whether agents observe the entries and places that this institution can show them, see
     `cprl.commons.views`."""
 
-    at_most: ClassVar[int | None] = None
+    most_in_game: ClassVar[int | None] = None
     """The largest number of institutions of this kind in a game; None for any number."""
-    needs: ClassVar[tuple[str, ...]] = ()
+    needed_switches: ClassVar[tuple[str, ...]] = ()
     """The switches of `Observation` that must be on for agents to understand what this institution shows."""
     shows_places: ClassVar[bool] = False
     """Whether it shows agents the cells where they may not harvest."""
@@ -76,12 +77,12 @@ class Institution(Value, stored=False):
         """Return the ballot by which N agents decide about it; None if they do not."""
         return None
 
-    def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
+    def shown_entries(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
         """Return the (entry, argument) pairs that it shows agents, with entries out of `entries`.
 
         Args:
             number: its index among the game's institutions of its kind, the argument by default.
-            ballot: the index of its ballot; for an institution without a ballot, of the next one.
+            ballot: the index in `Game.in_force` of what is decided about it, or -1.
             agents: the number of agents N.
         """
         return [(entry, number) for entry in self.entries]
@@ -128,18 +129,17 @@ def with_ballots(game: Any, kind: type[Kind]) -> list[tuple[Kind, int]]:
 
     An institution that is voted on counts as one of its kind.
     """
-    governed = None if game.governor is None else game.governor.governed(game)
     return [
-        (institution.rule, ballot if institution.ballot(game.agents) or institution is governed else -1)
-        for institution, ballot in numbered(game)
+        (institution.rule, ballot)
+        for institution, ballot in with_ballot_index(game)
         if isinstance(institution.rule, kind)
     ]
 
 
-def columns(kind: type[Kind], arrays: Any, game: Any) -> dict[str, Any]:
+def field_values(kind: type[Kind], arrays: Any, game: Any) -> dict[str, Any]:
     """Return the parameters that a module takes from the fields of its institutions.
 
-    Each entry of `arrays`, the class `Arrays` of the module, that is named like a field of `kind` gets a list
+    Each entry of `arrays`, the class of the module's arrays, that is named like a field of `kind` gets a list
     with the value of that field in each institution of the game, 0 for None. The entry "ballot" gets the
     indices of their ballots, or -1.
     """
@@ -151,15 +151,20 @@ def columns(kind: type[Kind], arrays: Any, game: Any) -> dict[str, Any]:
     return entries
 
 
-def numbered(game: Any) -> Iterator[tuple[Institution, int]]:
-    """Yield the institutions of a game, each with the number of ballots before it: the index of its own. A
-    governor, and what it governs, come after all ballots."""
+def with_ballot_index(game: Any) -> Iterator[tuple[Institution, int]]:
+    """Yield the institutions of a game, each with the index in `Game.in_force` of what is decided about it,
+    or -1. What a governor sets comes after all ballots."""
     ballots = 0
     governor = game.governor
     last = () if governor is None else (governor, governor.governed(game))
     for institution in game.institutions:
-        yield institution, len(game.ballots) if any(institution is each for each in last) else ballots
-        ballots += institution.ballot(game.agents) is not None
+        if any(institution is each for each in last):
+            yield institution, len(game.ballots)
+        elif institution.ballot(game.agents):
+            yield institution, ballots
+            ballots += 1
+        else:
+            yield institution, -1
 
 
 def threshold(prob: float) -> int:

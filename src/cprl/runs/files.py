@@ -38,7 +38,7 @@ RECIPE_FORMAT: Final = 2
 """The format of `recipe.json`, and of the journal and `report.json` beside it."""
 MANIFEST_FORMAT: Final = 1
 """The format of `manifest.json`, and of what it lists: weights, tables, transforms, decisions."""
-TRAINING_STATE_FORMAT: Final = 8
+TRAINING_STATE_FORMAT: Final = 9
 """The format of checkpoints."""
 STUDY_FORMAT: Final = 1
 """The format of `study.json`."""
