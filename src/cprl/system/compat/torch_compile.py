@@ -20,8 +20,8 @@ COMPILE_OPTIONS: Final[Mapping[str, Any]] = {
 }
 """Options of `torch.compile`. Compiled code runs in one thread; torch's threads, whatever their number, are
 for matrix products. With two threads in compiled code as well, a training was thirty times slower, presumably
-because the threads of two OpenMP runtimes block each other's cores while they wait. To precompile headers takes
-five seconds of a processor and 140 MB for each set of options, and saves nothing later."""
+because the threads of two OpenMP runtimes block each other's cores while they wait. To precompile headers
+takes five seconds of a processor and 140 MB for each set of options, and then saves nothing."""
 
 NO_GUARDS: Final[Mapping[str, Any]] = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
 """Further options, for functions whose guards torch itself finds broken; `guards_hold` must not be asked
