@@ -96,8 +96,8 @@ class Map(Value):
         return f"Map({self.height} x {self.width}, {len(self.sites)} sites, {self.agents} agents)"
 
     def _repr_html_(self) -> str:
-        """Return the board as SVG, for notebooks; the game knows nothing of pictures."""
-        return import_module("cprl.pictures.svg").board_svg(self)
+        """Return a picture of the board, for notebooks; the game knows nothing of pictures."""
+        return import_module("cprl.pictures.image").board_html(self)
 
     @property
     def agents(self) -> int:

@@ -11,12 +11,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
-from cprl import keys, recurrent_state
+from cprl import keys
 from cprl.commons.batch import Batch
 from cprl.commons.game import Game, output_forms
 from cprl.commons.world import PLAYING, StepOutput
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
 from cprl.envs.stepping import carry_on, read_choices
+from cprl.keys import recurrent_state
 from cprl.pictures.image import world_image
 from cprl.system.compat.tensordicts import unchecked_tensordict
 from cprl.system.compat.torchrl import LeanStepEnv, flag_spec

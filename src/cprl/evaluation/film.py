@@ -100,8 +100,7 @@ def _record_to_file(fresh_episode: FreshEpisode, target: Path) -> Episode:
         title=f"{legible(run.path.name)}, replica {fresh_episode.replica}, episode {fresh_episode.episode}",
         episodes=1,
         recipe=run.recipe,
-        file_name=target.name,
-        is_replay=True,
+        replay=target.name,
     ) as viewer:
         logger = viewer.logger
         scene = logger.scene

@@ -8,8 +8,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from cprl import recurrent_state
-from cprl.keys import Turn
+from cprl.keys import Turn, recurrent_state
 from cprl.learners.draw import Draw
 from cprl.learners.lanes import Lanes
 from cprl.learners.networks import LaneNetworks

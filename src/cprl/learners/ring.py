@@ -19,7 +19,7 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from cprl import recurrent_state
+from cprl.keys import recurrent_state
 from cprl.learners.draw import Draw
 from cprl.learners.transitions import Horizon, LaneTurn, Sizes, TransitionForm, array_of, refuse_other_dtype
 from cprl.policies.rng import DRAWN_AHEAD, LaneRng

@@ -65,6 +65,9 @@ def write_atomically(
 
     Args:
         name: returns the final name for the complete temporary file, if it depends on the content.
+
+    Raises:
+        OSError: if it cannot be written; an existing file is intact.
     """
     partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}.partial")
     try:

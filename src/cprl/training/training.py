@@ -16,12 +16,12 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl import keys, recurrent_state
+from cprl import keys
 from cprl.commons.spaces import Spaces
 from cprl.envs.env_state import env_state, load_env_state, load_transforms_state, transforms_state
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.unwrap import commons_game_of
-from cprl.keys import Turn
+from cprl.keys import Turn, recurrent_state
 from cprl.learners.learner import Learner
 from cprl.measuring.series import Observer
 from cprl.measuring.tracker import Episode, example_episode, tracker_of, with_missing
@@ -425,7 +425,7 @@ class Training:
         if state["carried"] is not None:
             self._step_collector().carried = template.empty(recurse=True).update(state["carried"])
         for name, parts in self._stateful_parts().items():
-            for part, part_state in zip(parts, state.get(name, ()), strict=True):
+            for part, part_state in zip(parts, state[name], strict=True):
                 part.load_state_dict(part_state)
         for name, callback in self._stateful_callbacks().items():
             if name in state["callbacks"]:  # a resumed training may have another viewer
