@@ -199,16 +199,17 @@ class Population:
         return networks
 
     def _make_governor(self, spec: GovernorSpec | None, from_turn: int) -> Governing | None:
-        if self._game is None or self._game.governor is None:
+        if spec is None:
             return None
+        assert self._game is not None
+        assert self._game.governor is not None
         actor = self._stored_governor(Purpose.EXPLORATION, self.worlds)
         learner = None
         if isinstance(spec, Learning):
             spaces = governor_spaces(self._game)
             learner = self._make_learner(spec, (self.spaces.agents,), "eager", spaces)
             actor = GovernorActor(self._game.governor, learner.actor)
-        if actor is None:
-            return None
+        assert actor is not None
         actor.from_turn = from_turn
         return Governing(self._game, actor, learner)
 
