@@ -18,9 +18,9 @@ from typing import Any, Final
 import tyro
 
 from cprl import Experiment
-from cprl.evaluation.film import write_gif
 from cprl.evaluation.fresh import fresh_episodes, record
 from cprl.evaluation.populations import commons_game
+from cprl.evaluation.video_files import write_gif
 from cprl.pictures.image import world_image
 from cprl.pictures.readable import legend_of
 from cprl.population import specs_by_agent

@@ -40,7 +40,7 @@ REFERENCE: Final = {
 """A page each, in reading order, and what it is about."""
 
 _MODULES: Final = {
-    "commons": ("maps", "published", "observation", "rules", "game", "spaces", "state"),
+    "commons": ("maps", "named_games", "observation", "rules", "game", "spaces", "state"),
     "envs": ("make_env",),
     "experiment": ("presets",),
     "experimental": (

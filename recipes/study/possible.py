@@ -17,8 +17,8 @@ from yield_bounds import yield_bounds
 
 from cprl import presets
 from cprl.commons.game import Game
+from cprl.measuring.registry import constants_of
 from cprl.measuring.statistics import estimate
-from cprl.measuring.tracker import yield_of_game
 from cprl.system.output import say
 
 
@@ -105,7 +105,7 @@ def sections(results: Sequence[Result]) -> list[str]:
 def _cells(result: Result) -> list[str]:
     game = result.experiment.game
     bounds = possible(game)
-    board = yield_of_game(game)
+    board = constants_of(game)
     harvests = result.at_end("collective_return")
     bearable = board["sustainable_yield"] * result.curves["survival_steps"] + board["first_stock"]
     yield_shares = (result.curves["collective_return"] / bearable)[:, -LAST:]

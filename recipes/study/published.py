@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 from pyarrow import csv
 
-from cprl.commons.published import Board
+from cprl.commons.named_games import Board
 from cprl.measuring.table import where
 from cprl.values.array_types import Float64
 

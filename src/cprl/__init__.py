@@ -180,25 +180,25 @@ def _register() -> None:
     """Register games with `gymnasium.make`, as played by one agent, which imports them when it makes one."""
     import gymnasium
 
-    from cprl.commons.literature import SOURCES
+    from cprl.commons.literature import LITERATURE_GAMES
 
     gymnasium.register("cprl/Commons-v0", entry_point="cprl.envs.gymnasium_env:CommonsGymnasiumEnv")
-    boards = {"cprl/SingleBasic-v0": "single_basic", "cprl/SingleComplex-v0": "single_complex"}
-    boards |= {name: name for name in SOURCES}
-    for name, board in boards.items():
-        gymnasium.register(name, entry_point=f"{_PRESETS}:gymnasium_env", kwargs={"board": board})
+    games = {"cprl/SingleBasic-v0": "single_basic", "cprl/SingleComplex-v0": "single_complex"}
+    games |= {name: name for name in LITERATURE_GAMES}
+    for gym_id, name in games.items():
+        gymnasium.register(gym_id, entry_point=f"{_PRESETS}:gymnasium_env", kwargs={"name": name})
 
 
 def _register_parallel() -> None:
     """Register games with `pettingzoo.make`, as a parallel environment of all agents."""
     import pettingzoo
 
-    from cprl.commons.literature import SOURCES
+    from cprl.commons.literature import LITERATURE_GAMES
 
     if hasattr(pettingzoo, "register"):  # since 1.27
-        for name in SOURCES:
+        for name in LITERATURE_GAMES:
             pettingzoo.register(
-                "parallel", name, entry_point=f"{_PRESETS}:pettingzoo_env", kwargs={"board": name}
+                "parallel", name, entry_point=f"{_PRESETS}:pettingzoo_env", kwargs={"name": name}
             )
 
 

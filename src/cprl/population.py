@@ -246,14 +246,18 @@ def _count(description: str, count: int) -> str:
     return f"{count} agent{'s' * (count > 1)} {description}"
 
 
+def algorithm_name(spec: Learning | Team) -> str:
+    """Return the name of the algorithm by which an agent learns, e.g. "QMIX"."""
+    algorithm = spec.algorithm
+    return algorithm.target if isinstance(algorithm, Custom) else type(algorithm).__name__
+
+
 def _describe(spec: AgentSpec) -> str:
     """Return how an agent learned, in words that follow "agent", e.g. "by QMIX as a team"; "" of a person."""
     match spec:
         case Learning() | Team():
             team = " as a team" if isinstance(spec, Team) else ""
-            algorithm = spec.algorithm
-            name = algorithm.target if isinstance(algorithm, Custom) else type(algorithm).__name__
-            return f"by {name}{team}"
+            return f"by {algorithm_name(spec)}{team}"
         case Scripted():
             return f"by the script {spec.policy!r}"
         case Language():

@@ -15,7 +15,7 @@ from places import SUPPORT
 
 from cprl import CommonsEnv, keys, presets
 from cprl.algorithms import DQN
-from cprl.commons.literature import SOURCES
+from cprl.commons.literature import LITERATURE_GAMES
 from cprl.learners.settings import DQNSettings
 from cprl.measuring.playing import evaluate
 from cprl.policies.actors import RandomActor
@@ -67,7 +67,7 @@ def test_the_gpu_plays_the_same_game_as_the_cpu(board, variant):
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("name", SOURCES)
+@pytest.mark.parametrize("name", LITERATURE_GAMES)
 def test_the_gpu_plays_the_games_of_the_literature(name):
     check_gpu(presets.game(name), turns=60)
 

@@ -19,7 +19,7 @@ from random_games import (
 
 from cprl import Observation, RandomEnd, River, Rules, maps, presets
 from cprl.commons.batch import Batch
-from cprl.commons.literature import SOURCES
+from cprl.commons.literature import LITERATURE_GAMES
 from cprl.commons.near import growth
 from cprl.institutions import Punishment
 from cprl.values import from_config, to_config
@@ -138,7 +138,7 @@ def test_a_state_under_these_rules_determines_the_future(game, seed):
         assert_same(one, two)
 
 
-@pytest.mark.parametrize("name", SOURCES)
+@pytest.mark.parametrize("name", LITERATURE_GAMES)
 def test_a_game_of_the_literature_is_made_everywhere_by_its_id(name):
     game = presets.game(name)
     assert presets.game(name) == game

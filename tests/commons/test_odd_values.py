@@ -11,7 +11,7 @@ from cprl import CommonsEnv, Game, Map, Rules, maps
 from cprl.commons.batch import Batch
 from cprl.commons.near import neighbours
 from cprl.envs import CommonsGymnasiumEnv, parallel_env
-from cprl.evaluation.film import film
+from cprl.evaluation.film import record_episode
 
 GAME = Game(map=maps.parse(">A.\n.A."), rules=Rules(may_fire=False))
 BOARD = partial(Map, height=3, width=3, sites=((0, 0),), starts=((1, 1, 0),))
@@ -31,7 +31,7 @@ NAN = float("nan")
         (lambda: CommonsEnv(GAME, device="x"), "device"),
         (lambda: CommonsGymnasiumEnv(GAME).step(0), "reset"),
         (lambda: phases.find_phases([0, 1e9], {"a": [1, 2]}), "episodes"),
-        (lambda: film("run", episode=2**32), "episode"),
+        (lambda: record_episode("run", episode=2**32), "episode"),
     ],
 )
 def test_it_is_refused_by_its_name(call, name):

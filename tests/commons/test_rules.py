@@ -63,7 +63,7 @@ def test_without_a_beam_there_are_seven_actions_and_six_is_stay():
 @pytest.mark.parametrize(
     ("board", "variant", "field"),
     [
-        ("pond", "published", "board is 'pond'"),
+        ("pond", "published", "(name|board) is 'pond'"),
         ("commons", "as_writen", "variant"),
         ("ssd/harvest-v1", "as_run", "(board|variant) is "),
         ("two_complex", "as_run_10_april", "variant"),

@@ -14,7 +14,7 @@ from cprl.commons.batch import Batch
 from cprl.commons.near import sites_around
 from cprl.commons.yields import sustainable_yield
 from cprl.institutions import Quota
-from cprl.measuring.tracker import yield_of_game
+from cprl.measuring.registry import constants_of
 
 FAR = maps.crosses(height=7, width=30, centres=((3, 3), (3, 12), (3, 21)), starts=((0, 0, 0),))
 
@@ -138,12 +138,12 @@ def test_a_rule_for_which_no_yield_is_proven_is_refused_by_name_and_has_no_share
     few = replace(presets.game("commons"), rules=replace(PUBLISHED, first_stock_share=0.5))
     with pytest.raises(ValueError, match=r"Rules\.first_stock_share is 0\.5, with which no yield"):
         sustainable_yield(few.map, few.rules)
-    assert yield_of_game(few) == {}
+    assert constants_of(few) == {}
     grows_anywhere = replace(PUBLISHED, first_stock_share=0.5, regrow_prob=(0.01, 0.1))
     assert sustainable_yield(few.map, grows_anywhere) > 0
     monkeypatch.setattr(yields, "PROVEN", yields.PROVEN - {"hits_to_tag"})
     game = presets.game("commons", variant="as_run")
     with pytest.raises(ValueError, match=r"Rules\.hits_to_tag is 2, with which no yield of a board"):
         Batch(replace(game, institutions=(Quota(),)), 1)
-    assert yield_of_game(game) == {}
-    assert yield_of_game(presets.game("commons"))["sustainable_yield"] > 0
+    assert constants_of(game) == {}
+    assert constants_of(presets.game("commons"))["sustainable_yield"] > 0

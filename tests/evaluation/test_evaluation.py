@@ -44,7 +44,7 @@ from cprl.evaluation import (
     run_scenarios,
     scenarios_of,
 )
-from cprl.evaluation.cross_play import CROSS_PLAY_RETURNS, PAIR
+from cprl.evaluation.cross_play import CELL_LABELS, CROSS_PLAY_RETURNS
 from cprl.evaluation.populations import agents_of, join_tables, play_fresh, table_note
 from cprl.experimental.empirical_game import play_empirical_game
 from cprl.experimental.movement import trace
@@ -279,7 +279,7 @@ def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(corridors)
         ("sustainable", "greedy"): (0, (3 + 2) / 2, (3 + 2) / 2),
         ("sustainable", "sustainable"): (0, 0, 0),
     }
-    levels = cprl.estimates(found, [*CROSS_PLAY_RETURNS, *all_metrics(found)], by=PAIR)
+    levels = cprl.estimates(found, [*CROSS_PLAY_RETURNS, *all_metrics(found)], by=CELL_LABELS)
     assert set(levels.labels) == set(wanted)
     for at, means in wanted.items():
         assert tuple(levels[(*at, number)].value for number in CROSS_PLAY_RETURNS) == means
@@ -293,7 +293,7 @@ def test_a_matrix_of_scripted_agents_gives_the_numbers_worked_by_hand(corridors)
     assert (at_home.undefined, at_home.episodes) == (4, 4), "each episode once"
     self_play = where(found, focal="greedy", background="greedy")
     assert set(self_play["focal_agent"].to_pylist()) == {-1}
-    in_turn = cprl.estimates(by_focal_agent(found), CROSS_PLAY_RETURNS, by=(*PAIR, "focal_agent"))
+    in_turn = cprl.estimates(by_focal_agent(found), CROSS_PLAY_RETURNS, by=(*CELL_LABELS, "focal_agent"))
     assert [in_turn["greedy", "greedy", agent, "focal/return"].value for agent in (0, 1)] == [2, 3]
     assert [in_turn["greedy", "greedy", agent, "background/return"].value for agent in (0, 1)] == [3, 2]
 
@@ -355,7 +355,9 @@ def test_runs_have_given_names_those_of_their_directories_or_their_paths(corrido
     assert found["focal"].unique().to_pylist() == [str(corridors["greedy"]), str(copy)]
     found = cprl.crossplay({"bites": corridors["greedy"], "waits": corridors["sustainable"]}, fresh)
     assert (
-        cprl.estimates(found, "background/return", by=PAIR)["waits", "bites", "background/return"].value
+        cprl.estimates(found, "background/return", by=CELL_LABELS)[
+            "waits", "bites", "background/return"
+        ].value
         == 2.5
     )
 
@@ -403,7 +405,7 @@ def test_gains_are_differences_from_the_diagonal_paired_by_replica():
     # Sustainable among greedy agents: focal 1 - 2; background 2 - 2 = 0 and 3 - 2 = 1.
     sustainable = found.of("sustainable", "greedy")
     assert [one.value for one in sustainable.values()] == [-1, 0.5]
-    at_home = cprl.estimates(exploited(), "focal/return", by=PAIR)
+    at_home = cprl.estimates(exploited(), "focal/return", by=CELL_LABELS)
     assert [at_home[name, name, "focal/return"].value for name in ("greedy", "sustainable")] == [2, 6]
 
 

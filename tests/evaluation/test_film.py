@@ -20,7 +20,7 @@ from stored_runs import CORRIDORS, command, stored
 
 from cprl import Custom, Game, Rules, load, maps
 from cprl.commons.cells import APPLE, GROUND
-from cprl.evaluation.film import Style, film, film_video, titles_of
+from cprl.evaluation.film import Style, film_episode, record_episode, titles_of
 from cprl.evaluation.fresh import fresh_episodes
 from cprl.experimental.export_turns import export_turns
 from cprl.institutions import Monitoring, Quota
@@ -76,7 +76,7 @@ def apples_in(picture):
 
 
 def test_a_gif_shows_the_board_die_and_ends_with_a_card_of_two_seconds(runs, tmp_path, drawn):
-    path, (played,) = film_video(runs / "greedy", tmp_path / "film.gif", style=Style(width=300, fps=10))
+    path, (played,) = film_episode(runs / "greedy", tmp_path / "film.gif", style=Style(width=300, fps=10))
     assert (played.steps, played.harvest.tolist(), played.stock_left) == (3, [2, 3], 0)
     pictures, durations = frames_of(path)
     assert [apples_in(picture) for picture in pictures[:-1]] == LEFT
@@ -90,7 +90,7 @@ def test_a_gif_shows_the_board_die_and_ends_with_a_card_of_two_seconds(runs, tmp
 
 
 def test_every_nth_turn_is_shown_and_always_the_last_and_sites_without_an_apple_are_dim(runs, tmp_path):
-    path, _ = film_video(runs / "greedy", tmp_path / "own.gif", style=Style(every=2, width=300))
+    path, _ = film_episode(runs / "greedy", tmp_path / "own.gif", style=Style(every=2, width=300))
     pictures, _ = frames_of(path)
     assert [apples_in(picture) for picture in pictures[:-1]] == [LEFT[0], LEFT[2], LEFT[3]]
     under_agents, dead = [(0, 3), (2, 1)], sites_in(pictures[2])
@@ -101,7 +101,7 @@ def test_every_nth_turn_is_shown_and_always_the_last_and_sites_without_an_apple_
 
 def test_populations_play_side_by_side_on_one_clock_below_their_titles(runs, tmp_path, drawn):
     titles = ["Été", "quotas, 50 %"]
-    path, played = film_video(
+    path, played = film_episode(
         runs / "greedy",
         tmp_path / "both.gif",
         beside=[runs / "random"],
@@ -116,12 +116,12 @@ def test_populations_play_side_by_side_on_one_clock_below_their_titles(runs, tmp
     assert [apples_in(picture) for picture in left] == [*LEFT, *[0] * 6, 0]
     assert (left[3:-1] == left[3]).all(), "the dead board waits"
     assert all((now != before).any() for before, now in pairwise(right)), "the other plays"
-    _, alone = film_video(runs / "random", tmp_path / "alone.gif", style=Style(width=240))
+    _, alone = film_episode(runs / "random", tmp_path / "alone.gif", style=Style(width=240))
     assert alone[0].harvest.tolist() == played[1].harvest.tolist(), "as it plays alone"
 
 
 def test_boards_agents_and_clocks_may_differ_side_by_side(runs, tmp_path):
-    path, played = film_video(
+    path, played = film_episode(
         runs / "greedy", tmp_path / "film.mp4", beside=(runs / "meadow",), style=Style(width=500, fps=5)
     )
     assert [(episode.steps, len(episode.harvest)) for episode in played] == [(3, 2), (12, 3)]
@@ -152,13 +152,13 @@ def test_titles_are_what_tells_runs_apart(runs, tmp_path):
 
 
 def test_the_film_is_the_episode_that_the_recording_has(runs, tmp_path):
-    _, recorded = film(runs / "random", tmp_path / "own.rrd", episode=3)
-    _, (filmed,) = film_video(
+    _, recorded = record_episode(runs / "random", tmp_path / "own.rrd", episode=3)
+    _, (filmed,) = film_episode(
         runs / "random", tmp_path / "own.gif", episode=3, style=Style(every=9, width=240)
     )
     assert filmed.harvest.tolist() == recorded.harvest.tolist()
     assert filmed.metrics == pytest.approx(recorded.metrics, nan_ok=True)
-    _, (other,) = film_video(
+    _, (other,) = film_episode(
         runs / "random", tmp_path / "other.gif", episode=4, style=Style(every=9, width=240)
     )
     assert other.metrics["sustainability"] != recorded.metrics["sustainability"]
@@ -199,19 +199,19 @@ def pictures_of(path, wide):
 
 
 def test_an_mp4_without_imageio_ffmpeg_is_refused(runs, tmp_path, monkeypatch):
-    monkeypatch.setattr("cprl.evaluation.film.find_spec", lambda name: None)
+    monkeypatch.setattr("cprl.evaluation.video_files.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match="imageio-ffmpeg"):
-        film_video(runs / "greedy", tmp_path / "a.mp4")
+        film_episode(runs / "greedy", tmp_path / "a.mp4")
 
 
 @pytest.mark.parametrize("name", ["own.gif", "own.mp4", "own.rrd"])
 def test_a_film_that_is_interrupted_leaves_no_file_and_can_be_made_again(runs, tmp_path, monkeypatch, name):
-    make = film if name.endswith(".rrd") else partial(film_video, style=Style(width=240))
+    make = record_episode if name.endswith(".rrd") else partial(film_episode, style=Style(width=240))
     draw, drawn = EpisodePicture.draw, []
 
     def interrupted(*arguments, **named):
         drawn.append(arguments)
-        if len(drawn) == 6 or make is film:
+        if len(drawn) == 6 or make is record_episode:
             raise KeyboardInterrupt
         return draw(*arguments, **named)
 
@@ -289,7 +289,7 @@ def test_fresh_episodes_are_written_as_csv(runs, tmp_path, monkeypatch, capsys):
     said = command(monkeypatch, capsys, *words)
     rows = list(csv.DictReader(path.read_text().splitlines()))
     assert said == f"wrote {path}, {len(rows)} rows\n"
-    episode = film(runs / "greedy", tmp_path / "film.rrd", episode=1)[1]
+    episode = record_episode(runs / "greedy", tmp_path / "film.rrd", episode=1)[1]
     second = [row for row in rows if row["episode"] == "1"]
     assert len(second) == episode.steps * 2
     harvest = [sum(float(row["harvest"]) for row in second if row["agent"] == agent) for agent in "01"]
@@ -370,14 +370,14 @@ def test_fresh_episodes_are_written_as_minari_data_sets(runs, tmp_path, monkeypa
 
 
 def test_a_film_of_a_board_that_lives_says_what_is_left(runs, tmp_path, drawn):
-    _, (played,) = film_video(runs / "meadow", tmp_path / "film.gif", style=Style(width=240))
+    _, (played,) = film_episode(runs / "meadow", tmp_path / "film.gif", style=Style(width=240))
     apples = int(played.harvest.sum())
     picked = f"{apples} apple{'s'[: apples != 1]} picked"
     assert drawn[-1][2:] == ("", f"{picked} · {played.stock_left} of 4 still on the board")
 
 
 def test_an_mp4_has_a_picture_for_each_turn_and_holds_the_card(runs, tmp_path):
-    path, _ = film_video(runs / "greedy", tmp_path / "own.mp4", style=Style(width=240, fps=5))
+    path, _ = film_episode(runs / "greedy", tmp_path / "own.mp4", style=Style(width=240, fps=5))
     pictures = pictures_of(path, 240)
     assert len(pictures) == len(LEFT) + 2 * 5, "two seconds"
     greens = [(np.abs(picture.astype(int) - PALETTE[APPLE]) < 30).all(-1).sum() for picture in pictures]
@@ -388,11 +388,11 @@ def test_from_the_first_picture_on_a_line_says_what_the_episode_comes_to(runs, t
     said, draw = [], EpisodePicture.draw
 
     def noted(picture, moments, title, **words):
-        said.append((len(moments), words["comes_to"]))
+        said.append((len(moments), words["headline"]))
         return draw(picture, moments, title, **words)
 
     monkeypatch.setattr(EpisodePicture, "draw", noted)
-    film_video(runs / "greedy", tmp_path / "film.gif", style=Style(width=240))
+    film_episode(runs / "greedy", tmp_path / "film.gif", style=Style(width=240))
     assert said[0][0] == 1, "the board as it begins"
     assert {words for _, words in said} == {"This episode: 5 apples picked, gone for good at turn 3 of 9"}
 

@@ -11,7 +11,7 @@ from matrix_games import prisoners_dilemma
 from stored_runs import CORRIDORS, DQN, MEADOW, an_experiment, command, stored
 
 from cprl.commands.play_by_keys import play_in_terminal
-from cprl.evaluation.film import Style, film, film_video
+from cprl.evaluation.film import Style, film_episode, record_episode
 from cprl.evaluation.fresh import averages_of, fresh_episodes, fresh_seed, typical_replica
 from cprl.evaluation.play import open_session
 from cprl.runs.recipe import start_run
@@ -73,7 +73,7 @@ def first_five(run, replica, folder):
     """The turns and the apples of the first five fresh episodes of a replica."""
     reached = []
     for episode in range(5):
-        _, (played,) = film_video(
+        _, (played,) = film_episode(
             run, folder / f"{episode}.gif", replica=replica, episode=episode, style=SMALL
         )
         reached.append((played.steps, played.harvest.sum()))
@@ -96,7 +96,7 @@ def test_the_episode_is_the_one_of_five_whose_turns_and_apples_are_nearest_to_th
     far = np.sum(abs(reached - medians) / medians, axis=1)
     fresh = fresh_episode(run)
     assert (fresh.replica, far[fresh.episode]) == (0, min(far))
-    _, (filmed,) = film_video(run, tmp_path / "film.gif", style=SMALL)
+    _, (filmed,) = film_episode(run, tmp_path / "film.gif", style=SMALL)
     assert (filmed.steps, filmed.harvest.sum()) == tuple(reached[fresh.episode])
     again = fresh_episode(run)
     assert (again.replica, again.episode) == (fresh.replica, fresh.episode)
@@ -171,11 +171,11 @@ def test_nothing_is_said_of_what_agents_usually_get_in_another_game(run, capsys)
     assert "On average trained agent" not in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("how", ["film", "film_video", "show", "play"])
+@pytest.mark.parametrize("how", ["film", "film_episode", "show", "play"])
 def test_the_worlds_of_a_training_are_refused_as_fresh_ones(run, tmp_path, how):
     makes = {
-        "film": lambda: film(run, tmp_path / "a.rrd", seed=3),
-        "film_video": lambda: film_video(run, tmp_path / "a.gif", seed=3),
+        "film": lambda: record_episode(run, tmp_path / "a.rrd", seed=3),
+        "film_episode": lambda: film_episode(run, tmp_path / "a.gif", seed=3),
         "show": lambda: show(run, tmp_path / "a.html", seed=3),
         "play": lambda: open_session("commons", others=str(run), seed=3),
     }

@@ -52,7 +52,7 @@ def test_the_same_seed_and_keys_play_the_same_again(run):
         session = open_session(str(run), others="random", seed=seed)
         while not session.has_ended:
             session.act("stay")
-        return [moment.col[1] for moment in session.moments]
+        return [moment.col[1] for moment in session.boards]
 
     assert played(3) == played(3)
     assert len({tuple(played(seed)) for seed in range(4)}) > 1

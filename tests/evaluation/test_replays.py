@@ -10,7 +10,7 @@ from stored_runs import MEADOW, command, stored
 
 from cprl import CommonsEnv, keys
 from cprl.evaluation import crossplay, evaluate_run
-from cprl.evaluation.film import film
+from cprl.evaluation.film import record_episode
 from cprl.evaluation.fresh import fresh_episodes, record
 from cprl.evaluation.play import open_session
 from cprl.institutions import Tax, Vote
@@ -61,7 +61,7 @@ def test_people_are_shown_beside_trained_agents(run, tmp_path, monkeypatch, caps
 
 
 def test_a_recording_of_people_says_that_they_have_no_action_values(run, tmp_path):
-    path, episode = film(run, tmp_path / "people.rrd", replica=1)
+    path, episode = record_episode(run, tmp_path / "people.rrd", replica=1)
     assert path.stat().st_size
     assert episode.harvest.tolist() == where(read_episodes(run), replica=1)["harvest"].to_pylist()
 

@@ -14,7 +14,7 @@ import cprl
 from cprl import Custom, Experiment, Observation, maps
 from cprl.algorithms import DQN, PPO, QMIX, RolloutSettings
 from cprl.commands import main as cli
-from cprl.evaluation.film import film
+from cprl.evaluation.film import record_episode
 from cprl.networks import GRU
 from cprl.objectives.rewards import Exchange
 from cprl.population import Frozen, Learning, Scripted, Team
@@ -50,7 +50,7 @@ def test_an_experiment_with_parts_of_its_own_is_stopped_resumed_evaluated_and_fi
     tables = [cprl.evaluate_run(each, cprl.Fresh(episodes=2)) for each in (run, in_one_go)]
     assert repr(tables[0].to_pydict()) == repr(tables[1].to_pydict())
     assert cprl.load(run).experiment == MEADOW
-    recording, episode = film(run)
+    recording, episode = record_episode(run)
     assert episode.steps <= 20
     assert re.fullmatch(r"film-\d-\d\.rrd", recording.name), "a typical episode"
     assert (run / recording.name).stat().st_size > 10_000
@@ -128,7 +128,7 @@ def test_a_matrix_game_is_trained_stopped_resumed_evaluated_and_cross_played(tmp
     levels = cprl.estimates(played, "focal/return", by=("focal", "background"))
     assert len(levels) == 4
     assert levels["whole", "other", "focal/return"].replicas
-    film(whole)
+    record_episode(whole)
 
 
 FLAT = Custom(

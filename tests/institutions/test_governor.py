@@ -122,10 +122,12 @@ def test_the_environment_reads_the_rule_and_shows_what_can_be_seen():
 
 
 def test_a_governor_sees_the_equality_of_the_harvests_of_the_episode_so_far():
-    sight = Governor(sets="tax.rate", sees=("equality", "time"))
+    governor = Governor(sets="tax.rate", sees=("equality", "time"))
     apples = np.array([[3, 1, 0], [0, 0, 0], [2, 2, 2]])
     steps = np.array([4, 0, 2])
-    seen = sight.see(apples[:, 0] / 9, steps, apples, apples * 0, 8)
+    seen = governor.observe(
+        stock=apples[:, 0] / 9, elapsed_steps=steps, harvested=apples, violations=apples * 0, horizon_steps=8
+    )
     assert seen[:, 1].tolist() == [0.5, 0.0, 0.25]
     assert seen[1, 0] == 1, "nobody has less than another"
     assert seen[::2, 0].tolist() == pytest.approx(social.equality(apples[::2]).tolist())
@@ -188,11 +190,11 @@ def test_what_a_governor_wants_of_a_period_of_two_turns(objective, wanted):
 
 def test_an_episode_has_the_mean_of_what_was_in_force_and_the_objective_of_the_whole():
     play = Play(ROW, institutions=[LOST, Governor(sets="tax.rate", every_steps=2, least_stock=0.4)])
-    assert metrics_for((*OPTIONAL_ENTRIES, *INSTITUTION_ENTRIES), play.game.institutions)[-2:] == (
+    assert metrics_for((*OPTIONAL_ENTRIES, *INSTITUTION_ENTRIES), play.game)[-2:] == (
         "governor/rule",
         "governor/objective",
     )
-    totals = {"rules": np.array([[1.5]]), "steps": np.array([4]), "wanted": partial(welfare, play.game)}
+    totals = {"rules": np.array([[1.5]]), "steps": np.array([4]), "objective": partial(welfare, play.game)}
     paid = {"harvest": [[3.0, 1.0]], "fines": [[0.5, 0.5]], "transfers": [[0.0, 0.0]], "stock_left": [2]}
     found = compute_metrics(totals | {name: np.array(values) for name, values in paid.items()})
     assert found["governor/rule"].tolist() == [0.375]

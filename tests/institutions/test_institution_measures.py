@@ -63,7 +63,7 @@ TAGS = np.array([2, 1, 1, 0])
 OF_LAW = [
     name
     for name, metric in METRICS.items()
-    if metric.is_of_institutions and "wanted" not in metric.needs  # which games with a governor have
+    if metric.is_of_institutions and "objective" not in metric.needs  # which games with a governor have
 ]
 OF_GROUPS = {name for name in OF_LAW if name.endswith(("_within", "_between"))}
 COUNTED = {
@@ -199,6 +199,10 @@ def of_law(episode):
     return {name: value for name, value in episode.metrics.items() if name in OF_LAW}
 
 
+def two_agents(*institutions):
+    return Game(map=maps.parse(">A.<"), rules=Rules(), institutions=institutions)
+
+
 def played(*turns, **options):
     tracker = EpisodeTracker(turns[0].batch_size[0], 2, **options)
     return [episode for batch in turns for episode in tracker.add(batch)]
@@ -227,7 +231,8 @@ def test_an_episode_has_what_was_paid_broken_counted_and_decided():
 
 
 def test_a_table_has_the_counts_of_the_institutions_that_the_game_has_and_no_others():
-    (episode,) = played(*an_episode(), institutions=[Quota(share=0.5, window_steps=10), Monitoring(prob=0.5)])
+    game = two_agents(Quota(share=0.5, window_steps=10, fine=1.0), Monitoring(prob=0.5))
+    (episode,) = played(*an_episode(), game=game)
     table = table_of([episode])
     assert set(COUNT_NAMES) & set(table.column_names) == {"excess_bites", "violations", "detections"}
     of_counts = {name for name, metric in METRICS.items() if "counts" in metric.entries}
@@ -238,7 +243,7 @@ def test_a_table_has_the_counts_of_the_institutions_that_the_game_has_and_no_oth
 
 
 def test_with_groups_inequality_within_and_between_them_is_measured():
-    (episode,) = played(*an_episode(), institutions=[Levies(groups=((0,), (1,)))])
+    (episode,) = played(*an_episode(), game=two_agents(Levies(groups=((0,), (1,)))))
     assert episode.metrics["institutions/income_equality_within"] == 1.0
     assert episode.metrics["institutions/income_equality_between"] == pytest.approx(1 - 2 / 30)
     curves = as_curves(table_of([episode]))
@@ -247,7 +252,7 @@ def test_with_groups_inequality_within_and_between_them_is_measured():
 
 
 def test_a_viewer_that_goes_on_with_a_run_has_the_measures_of_groups(tmp_path):
-    (episode,) = played(*an_episode(), institutions=[Levies(groups=((0,), (1,)))])
+    (episode,) = played(*an_episode(), game=two_agents(Levies(groups=((0,), (1,)))))
     with EpisodeTable(tmp_path / "episodes.parquet") as table:
         table.add(episode)
     (again,) = stored_episodes(tmp_path)
@@ -274,12 +279,12 @@ def test_each_world_pays_for_itself_and_starts_anew():
 
 def test_a_tracker_goes_on_exactly_from_its_state(tmp_path):
     first, second, third = an_episode()
-    tracker = EpisodeTracker(1, 2, institutions=[Levies(groups=((0,), (1,)))])
+    tracker = EpisodeTracker(1, 2, game=two_agents(Levies(groups=((0,), (1,)))))
     tracker.add(first)
     torch.save(tracker.state_dict(), tmp_path / "tracker.pt")
     expected = all_written_out(tracker, [second, third, *an_episode()])
     for begun in (False, True):
-        other = EpisodeTracker(1, 2, institutions=[Levies(groups=((0,), (1,)))])
+        other = EpisodeTracker(1, 2, game=two_agents(Levies(groups=((0,), (1,)))))
         if begun:
             other.add(second)
         other.load_state_dict(torch.load(tmp_path / "tracker.pt"))
@@ -377,7 +382,7 @@ GAME = Game(
 def play(game, *, worlds=3, episodes=2):
     """Episodes of random agents, and the batches."""
     env = CommonsEnv(game, worlds, seed=2)
-    tracker = EpisodeTracker(worlds, game.agents, institutions=game.institutions)
+    tracker = EpisodeTracker(worlds, game.agents, game=game)
     torch.manual_seed(1)
     found, batches, moment = [], [], env.reset()
     while len(found) < worlds * episodes:
@@ -425,9 +430,11 @@ def test_a_game_with_all_institutions_has_all_metrics_and_others_those_that_conc
     }
     for institution in MANY:
         own = kinds[type(institution)]
+        game = dataclasses.replace(GAME, institutions=(institution,))
         own = {name if name in OF_LAW else f"institutions/{name}" for name in own}
-        assert set(metrics_for(EVERYTHING, [institution])) & set(OF_LAW) == always | own
-    assert "institutions/excess_bites" in metrics_for(EVERYTHING, [Vote(on=Quota(), choices=(0.5, 1.0))])
+        assert set(metrics_for(EVERYTHING, game)) & set(OF_LAW) == always | own
+    voting = dataclasses.replace(GAME, institutions=(Vote(on=Quota(), choices=(0.5, 1.0)),))
+    assert "institutions/excess_bites" in metrics_for(EVERYTHING, voting)
     (taxed, *_), _ = play(dataclasses.replace(GAME, institutions=(Tax(rate=0.5),)), episodes=1)
     assert set(of_law(taxed)) == always
     assert taxed.fines.sum() == pytest.approx(taxed.harvest.sum() / 2)

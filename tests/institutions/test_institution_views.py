@@ -18,7 +18,7 @@ from torchrl.envs import TransformedEnv
 import cprl
 from cprl import CommonsEnv, Custom, Experiment, Game, Rules, maps
 from cprl.evaluation import Fresh, evaluate_run
-from cprl.evaluation.film import Style, film, film_video
+from cprl.evaluation.film import Style, film_episode, record_episode
 from cprl.institutions import Boundaries, GraduatedSanctions, Monitoring, Sanctioner, Tax, Vote
 from cprl.measuring.registry import reported_by
 from cprl.measuring.statistics import estimates, number_format
@@ -167,7 +167,7 @@ def test_a_recording_without_institutions_has_nothing_of_them(tmp_path):
 @pytest.mark.integration
 def test_a_replay_marks_who_breaks_a_rule_in_its_turn_and_shows_payments(whole, tmp_path):
     cprl.trust(*ALLOW)
-    path, episode = film(whole, tmp_path / "replay.rrd")
+    path, episode = record_episode(whole, tmp_path / "replay.rrd")
     frames, marks = column(path, "world/violators", "LineStrips2D:strips", "frame")
     assert frames == list(range(episode.steps - 1)), "the last turn has no frame"
     _, texts = column(path, "log", "TextLog:text", "step")
@@ -204,7 +204,7 @@ def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
 @pytest.mark.integration
 def test_a_film_marks_who_broke_a_rule_since_its_last_picture(whole, tmp_path):
     cprl.trust(*ALLOW)
-    path, (episode,) = film_video(whole, tmp_path / "film.gif", style=Style(width=400, every=1))
+    path, (episode,) = film_episode(whole, tmp_path / "film.gif", style=Style(width=400, every=1))
     assert episode.violations.sum() > 0
     pictures, _ = frames_of(path)
     picture = EpisodePicture(GAME.map, steps=30, width=400)

@@ -40,7 +40,7 @@ from cprl.algorithms import (
     RolloutSettings,
 )
 from cprl.envs import make_env, spaces_of
-from cprl.evaluation.film import film
+from cprl.evaluation.film import record_episode
 from cprl.evaluation.play import open_session
 from cprl.experimental.movement import trace
 from cprl.measuring.playing import evaluate
@@ -388,7 +388,7 @@ def test_a_stored_run_is_loaded_evaluated_filmed_and_played_against(ran):
         )
         for one, other in zip(returns(found, policy="trained")[replica], alone, strict=True):
             assert np.array_equal(one, other.return_)
-    recording, _ = film(run)
+    recording, _ = record_episode(run)
     assert recording.stat().st_size > 10_000
     session = open_session(str(run), agent=2, steps=5)
     for _ in range(5):

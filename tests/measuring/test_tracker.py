@@ -1,5 +1,6 @@
 """EpisodeTracker: whole episodes out of batches of turns."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -162,10 +163,12 @@ def test_neither_a_state_nor_an_episode_changes_when_more_is_played():
 
 
 def test_a_yield_adds_its_share_to_the_metrics_and_what_does_not_fit_is_named():
-    tracker = EpisodeTracker(1, 2, sustainable_yield=1.5, first_stock=2.5)
-    (episode,) = tracker.add(turn(harvest=[[1, 1]], done=[[True]]))
-    assert episode.metrics["yield_share"] == 0.5
-    assert list(episode.metrics) == [*metrics_for(OPTIONAL_ENTRIES)[:-1], "yield_share", "stock_left"]
+    game = replace(GAME, rules=replace(GAME.rules, regrow_prob=(0.5, 0.5)))
+    assert (game.sustainable_yield, game.tables.first_stock) == (1.0, 3)
+    (episode,) = EpisodeTracker(1, 2, game=game).add(turn(harvest=[[2, 1]], done=[[True]]))
+    assert episode.metrics["yield_share"] == 3 / (1 + 3)
+    expected = [*metrics_for(OPTIONAL_ENTRIES)[:-1], "yield_share", "stock_left"]
+    assert list(episode.metrics) == expected
     tracker = EpisodeTracker(2, 2)
     with pytest.raises(ValueError, match=r"the batch is \[1\]; allowed: \[2\] or \[2, T\]"):
         tracker.add(turn(worlds=1))

@@ -9,7 +9,7 @@ from hypothesis import given, settings, strategies as st
 from valid_values import valid
 
 from cprl import CommonsEnv, Game, Rules, maps, presets
-from cprl.commons.published import GAMES
+from cprl.commons.named_games import GAMES
 from cprl.institutions import (
     Boundaries,
     ClosedPatches,

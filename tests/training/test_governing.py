@@ -14,7 +14,7 @@ import cprl
 from cprl import keys
 from cprl.algorithms import DQN, PPO, DQNSettings, RolloutSettings
 from cprl.evaluation.cross_play import crossplay
-from cprl.evaluation.film import film
+from cprl.evaluation.film import record_episode
 from cprl.evaluation.populations import play_population
 from cprl.institutions import Governor, Quota, Tax
 from cprl.policies.governors import Constant, StockRule
@@ -177,7 +177,7 @@ def test_a_frozen_governor_meets_fresh_agents_and_plays_in_evaluations(tmp_path,
     with pytest.raises(ValueError, match="after the last one"):
         make_agents(replace(again, governor=Frozen("first", 1)))
     other = replace(GAME, institutions=(Tax(), replace(GOVERNOR, options=(0.0, 1.0))))
-    with pytest.raises(ValueError, match="sees"):
+    with pytest.raises(ValueError, match="options"):
         make_agents(replace(again, game=other))
 
 
@@ -250,7 +250,7 @@ def test_a_governor_of_a_quota_opens_and_closes_the_harvest():
 @pytest.mark.integration
 def test_a_film_draws_the_number_in_force_under_the_stock(tmp_path):
     run = cprl.run(replace(EXPERIMENT, governor=StockRule()), tmp_path / "run", **QUIET)
-    path, _ = film(run, tmp_path / "film.rrd", episode=0)
+    path, _ = record_episode(run, tmp_path / "film.rrd", episode=0)
     drawn, rates = column(path, "turn/rule", "Scalars:scalars")
     times, _ = column(path, "turn/stock", "Scalars:scalars")
     assert drawn == times

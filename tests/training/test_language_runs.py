@@ -17,7 +17,7 @@ from small_learners import ALGORITHMS
 
 import cprl
 from cprl import Fresh
-from cprl.evaluation.film import Style, film_video
+from cprl.evaluation.film import Style, film_episode
 from cprl.policies.asking import CALLS, read_calls
 from cprl.population import Frozen, Learning, Scripted, learned
 from cprl.runs.export import export_results
@@ -155,7 +155,7 @@ def test_language_agents_are_filmed_and_shown_and_play_in_cross_play(tmp_path):
         scripts = experiment(None, agents=(Scripted("greedy"),) * 4, **fields)
         cprl.run(scripts, runs[1], watch="off", figures=False)
         asked = len(server.requests)
-        _, (filmed,) = film_video(runs[0], tmp_path / "film.gif", style=Style(width=240, fps=10))
+        _, (filmed,) = film_episode(runs[0], tmp_path / "film.gif", style=Style(width=240, fps=10))
         assert len(server.requests) > asked
         asked = len(server.requests)
         _, (shown,) = show(runs[0], tmp_path / "show.html")

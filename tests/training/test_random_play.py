@@ -83,7 +83,7 @@ def test_a_run_has_the_same_outcome_watched_or_not_and_its_recording_shows_the_e
         for policy in ("random", "trained")
     )
     means = [harvest.reshape(EXPERIMENT.replicas, -1).mean(1) for harvest in harvests]
-    estimates = [estimate(of_replicas).of("collective_return") for of_replicas in means]
+    estimates = [estimate(of_replicas).bounded("collective_return") for of_replicas in means]
     random, trained = (each.value for each in estimates)
     assert headers[0].startswith("#### Episode 1 of 3 · begins")
     assert headers[-2].startswith("#### Episode 3 of 3 · begins, exploring · ")

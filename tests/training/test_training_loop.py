@@ -62,7 +62,7 @@ def train_with(worlds, *, agent, episodes, **arguments):
 @pytest.mark.parametrize(
     ("worlds", "arguments", "message"),
     [
-        (1, {"others": {}}, r"control the agents \[0\]"),
+        (1, {"others": {}}, r"1 actors for 2 agents"),
         (1, {"others": {0: RandomActor(8), **OTHER}}, r"control the agents \[0, 0, 1\]"),
         (1, {"episodes": 0}, "episodes is 0"),
         (1, {"callbacks": [7]}, "callback 7"),

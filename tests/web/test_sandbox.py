@@ -18,7 +18,7 @@ import pytest
 from viewers import browser, wait_until
 
 from cprl import maps, presets
-from cprl.commons.published import Board
+from cprl.commons.named_games import Board
 from cprl.institutions import GraduatedSanctions, Quota, Tax
 from cprl.values import hints_of
 from cprl.web.playable import playable

@@ -155,9 +155,7 @@ def draw(outcomes: Outcomes, courses: pa.Table, path: Path) -> None:
                 draw_dots(axes, [place * thousands[-1]], [end], color=colour)
             axes.axhline(random_play(outcomes).value, **RANDOM_LINE, label="random play")
             axes.set_title(name)
-        for axes in panels[-4:]:
-            axes.tick_params(labelbottom=True)
-            axes.set_xlabel("thousand steps")
+        sheet.xlabel = "thousand steps"
         sheet.title = "Income under each institution, apples"
         sheet.caption = (
             "Lines: means of the episodes that end within 20,000 steps, while agents learn; dots: frozen, in "

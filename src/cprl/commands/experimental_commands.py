@@ -31,7 +31,7 @@ from cprl.commands.studies import (
     say_result,
     study_fields,
 )
-from cprl.commons.published import check_board
+from cprl.commons.named_games import check_game_source
 from cprl.system.defaults import EGTA_RESAMPLES, SEED, Fresh
 from cprl.system.output import say
 from cprl.system.waiting_room import experimental
@@ -71,15 +71,15 @@ def schelling(
 
     The figure is the Schelling diagram.
     """
-    check_board(board)
+    check_game_source(board)
     begin_playing(mixes.seed, files=files)
 
-    from cprl.evaluation.play import board_named
+    from cprl.evaluation.play import game_and_run
 
     play_all_mixes = experimental("schelling.schelling")
     schelling_tables = experimental("schelling.schelling_tables")
     draw_schelling = experimental("schelling.draw_schelling")
-    game, run = board_named(board, variant)
+    game, run = game_and_run(board, variant)
     fresh = Fresh(episodes=mixes.episodes, replicas=mixes.replicas, seed=mixes.seed)
     players = {"restrained": mixes.restrained, "greedy": mixes.greedy}
     where = game if run is None else run

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Union, get_arg
 import tyro
 from tyro.constructors import ConstructorRegistry, StructConstructorSpec, StructFieldSpec, StructTypeInfo
 
-from cprl.commons.published import Variant
+from cprl.commons.named_games import Variant
 from cprl.system.output import say
 from cprl.values import Custom, hints_of, matches_type, refusal
 

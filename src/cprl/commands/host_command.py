@@ -9,7 +9,7 @@ import tyro
 
 from cprl.commands.flags import BoardArgument, institutions_named
 from cprl.commands.play_stored import begin_playing
-from cprl.commons.published import check_board
+from cprl.commons.named_games import check_game_source
 from cprl.system.working import working
 from cprl.web.hosting import Hosting
 
@@ -53,7 +53,7 @@ def host(
                 f'cprl host needs {package}, which is not installed; run pip install "cprl[web]"',
                 name=package,
             )
-    check_board(board)
+    check_game_source(board)
     treatments = tuple((Path(word).name.removesuffix(_TABLE), _institutions(word)) for word in rounds)
     text = None if consent is None else consent.read_text(encoding="utf-8")
     begin_playing(hosting.seed)

@@ -65,7 +65,7 @@ def state(session: Session) -> str:
     scores = []
     for agent, apples in enumerate(session.harvested):
         name = "you" if agent == session.agent else f"agent {agent}"
-        out = "" if session.moments[-1].in_play[agent] else " (out of play)"
+        out = "" if session.boards[-1].in_play[agent] else " (out of play)"
         scores.append(f"{apples} by {name}{out}")
     turn = f"turn {session.turn:,} of {session.game.rules.episode_steps:,}"
     return f"{turn}; {session.stock} apples on the board; harvested: {', '.join(scores)}"
@@ -116,9 +116,9 @@ def _play(session: Session, read_keys: Callable[[], str], help_end: str) -> None
     if session.has_ended:
         ending = "no apple is left" if session.stock == 0 else "time is over"
     say(f"The end: {ending}.")
-    if session.has_ended and session.usual:
+    if session.has_ended and session.average_harvest_text:
         apples = session.harvested[session.agent]
-        say(f"You got {apples} apple{'' if apples == 1 else 's'}. {session.usual}")
+        say(f"You got {apples} apple{'' if apples == 1 else 's'}. {session.average_harvest_text}")
     for name, value in session.metrics().items():
         number = "undefined" if isnan(value) else f"{value:.4g}"
         say(f"{name:17s} {number:>9s}  {title(name)}")
@@ -197,7 +197,7 @@ def board_text(session: Session) -> Text:
     `A` is an apple, `#` a wall, `~` the water of a river and `H` its waste, `*` a beam, and `.` any other
     cell. An agent has its number and the sign of its heading.
     """
-    board = session.moments[-1]
+    board = session.boards[-1]
     cell_width = len(str(session.game.agents - 1)) + 1
     signs = {**_SIGNS, WALL: "#" * cell_width}
     agent_signs = {}

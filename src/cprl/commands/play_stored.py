@@ -23,7 +23,7 @@ from cprl.commands.flags import (
     TableFlags,
     VariantFlag,
 )
-from cprl.commons.published import check_board
+from cprl.commons.named_games import check_game_source
 from cprl.system.defaults import (
     FILM_SEED,
     FILM_SUFFIXES,
@@ -99,17 +99,17 @@ def film(
         raise ValueError(f"--{next(iter(settings))} is for films; allowed: with --out FILE.gif or FILE.mp4")
     begin_playing(seed, run, *options.beside)
 
-    from cprl.evaluation.film import Style, film as film_run, film_video
+    from cprl.evaluation.film import Style, film_episode, record_episode
     from cprl.viewer.page import to_watch
 
     which: dict[str, Any] = {"replica": replica, "episode": episode, "seed": seed}
     if out is None or not is_video:
-        path, played = film_run(run, out, **which)
+        path, played = record_episode(run, out, **which)
         say(f"{played.steps} steps, {played.outcome}")
         say(f"Watch: {quote_command(to_watch(path))}")
         return
     beside = settings.pop("beside", ())
-    path, episodes = film_video(run, out, beside=beside, style=Style(**settings), **which)
+    path, episodes = film_episode(run, out, beside=beside, style=Style(**settings), **which)
     for path_of_run, played in zip((run, *beside), episodes, strict=True):
         say(f"{f'{path_of_run}: ' if beside else ''}{played.steps} steps, {played.outcome}")
     say(f"{path}: {path.stat().st_size / 1000:.0f} kB")
@@ -198,7 +198,7 @@ def play(
     board: BoardArgument, /, *, session: Annotated[SessionOptions, tyro.conf.arg(name="")] = SessionOptions()
 ) -> None:
     """Play in the terminal among trained or scripted agents, and measure the episode."""
-    check_board(board)
+    check_game_source(board)
     seed = PLAY_SEED if session.seed is None else session.seed
     begin_playing(seed)
 

@@ -28,7 +28,7 @@ from cprl.system.defaults import LAST_EPISODES
 from cprl.system.output import console, quote_command, say
 from cprl.system.shipped import command_line, is_shipped, program_name, recipe_named, typed_command_line
 from cprl.system.waiting_room import experimental
-from cprl.values import Range, checked
+from cprl.values import checked
 
 if TYPE_CHECKING:
     from cprl.experiment import Experiment
@@ -276,13 +276,14 @@ def recipe_of(source: Path) -> "Callable[..., Experiment]":
 
 def _about(study: "Study") -> str:
     """Return the text about a study in its `--help`."""
+    from cprl.studies.tables.tidy_table import abbreviated
+
     conditions = study.all_conditions
-    names = ", ".join(condition.name for condition in conditions[:_LISTED])
-    more = f" and {len(conditions) - _LISTED} more" if conditions[_LISTED:] else ""
+    names = abbreviated([condition.name for condition in conditions], _LISTED)
     parts = [
         study.question,
         f"Expected: {study.expectation}" if study.expectation else "",
-        f"{len(conditions)} conditions: {names}{more}; {study.replicas} replicas of each.",
+        f"{len(conditions)} conditions: {names}; {study.replicas} replicas of each.",
         ALLOW,
     ]
     return "\n\n".join(filter(None, parts))
@@ -295,9 +296,9 @@ _CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
 
 def executor_of(options: TrialOptions) -> "Executor":
     """Return the executor for the options --on, --jobs and --address."""
-    from cprl.studies.executors import InProcess, Processes
+    from cprl.studies.executors import InProcess, Jobs, Processes
 
-    jobs = 1 if options.jobs is None else checked("--jobs", options.jobs, Annotated[int, Range(1, 4096)])
+    jobs = 1 if options.jobs is None else checked("--jobs", options.jobs, Jobs)
     on = options.on or ("processes" if jobs > 1 else "here")
     if options.address is not None and on != "ray":
         raise ValueError(f"--address is for --on ray, and this is --on {on}; allowed: one with the other")

@@ -11,7 +11,7 @@ Modules in reading order. How a game is described:
 
     rules        Rules: every number of the game, with unit, range and source
     maps         Map: boards that are drawn, known by name, or generated
-    published    the published games by name: boards with their rules
+    named_games  the published games and those of the literature by name
     literature   the games of other programs and papers by name
     spaces       Spaces: the shapes of observations and the number of actions
     observation  Observation: the form in which agents observe the game

@@ -179,16 +179,17 @@ class Batch:
         self.driver.write(self.law.ledger.in_force, in_force)
 
     def seen(self) -> Float32:
-        """Return what the governor sees of each world, float32 [B, S], see `Governor.sees`."""
+        """Return the features that the governor observes of each world, float32 [B, S], see
+        `Governor.sees`."""
         assert self.game.governor is not None
         assert self.law is not None
         read = self.driver.read
-        return self.game.governor.see(
-            read(self.now.stock_left)[:, 0] / len(self.game.map.sites),
-            read(self.now.step)[:, 0],
-            read(self.now.harvested),
-            read(self.law.ledger.counts)[..., VIOLATIONS],
-            self.game.rules.episode_steps,
+        return self.game.governor.observe(
+            stock=read(self.now.stock_left)[:, 0] / len(self.game.map.sites),
+            elapsed_steps=read(self.now.step)[:, 0],
+            harvested=read(self.now.harvested),
+            violations=read(self.law.ledger.counts)[..., VIOLATIONS],
+            horizon_steps=self.game.rules.episode_steps,
         )
 
     def boards(self) -> UInt8:

@@ -184,7 +184,7 @@ class Game(Value):
     @property
     def in_force(self) -> tuple[Ballot, ...]:
         """Return all that is decided: the ballots, and last what a governor sets."""
-        return self.ballots if self.governor is None else (*self.ballots, self.governor.decided)
+        return self.ballots if self.governor is None else (*self.ballots, self.governor.controlled)
 
     @property
     def decisions(self) -> int:

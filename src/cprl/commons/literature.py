@@ -5,13 +5,14 @@ the sources, and cprl's own rules play them.
 """
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 if TYPE_CHECKING:
     from cprl.commons.game import Game
-    from cprl.commons.maps import Map
+    from cprl.commons.maps import Entrances, Map
 
-_OPEN: Final = """
+_OPEN_BOARD: Final = """
 WWWWWWWWWWWWWWWWWWWWWWWW
 WAAA    A      A    AAAW
 WAA    AAA    AAA    AAW
@@ -31,7 +32,7 @@ W PPPPPPPPPPPPPPPPPPPP W
 WPPPPPPPPPPPPPPPPPPPPPPW
 WWWWWWWWWWWWWWWWWWWWWWWW
 """
-_CLOSED: Final = """
+_CLOSED_BOARD: Final = """
 WWWWWWWWWWWWWWWWWWWWWWWW
 WAAA    A  WW  A    AAAW
 WAA    AAA WW AAA    AAW
@@ -51,7 +52,7 @@ W PPPPPPPPPPPPPPPPPPPP W
 WPPPPPPPPPPPPPPPPPPPPPPW
 WWWWWWWWWWWWWWWWWWWWWWWW
 """
-_PARTNERSHIP: Final = """
+_PARTNERSHIP_BOARD: Final = """
 WWWWWWWWWWWWWWWWWWWWWWWW
 WAAA    A  II  A    AAAW
 WAA    AAA II AAA    AAW
@@ -71,7 +72,7 @@ W PPPPPPPPPPPPPPPPPPPP W
 WPPPPPPPPPPPPPPPPPPPPPPW
 WWWWWWWWWWWWWWWWWWWWWWWW
 """
-_HARVEST: Final = """
+_HARVEST_BOARD: Final = """
 @@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@
 @ P   P      A    P AAAAA    P  A P  @
 @  P     A P AA    P    AAA    A  A  @
@@ -90,7 +91,7 @@ _HARVEST: Final = """
 @@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@@
 """
 
-_CLEANUP: Final = """
+_CLEANUP_BOARD: Final = """
 @@@@@@@@@@@@@@@@@@
 @RRRRRR     BBBBB@
 @HHHHHH      BBBB@
@@ -118,7 +119,7 @@ _CLEANUP: Final = """
 @@@@@@@@@@@@@@@@@@
 """
 
-_MELTING_POT: Final[dict[str, Any]] = {
+_MELTING_POT_RULES: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.001, 0.005, 0.025),
     "growth": "before_bites",
     "beam_length_cells": 4,
@@ -137,13 +138,13 @@ _MELTING_POT: Final[dict[str, Any]] = {
     "random_end": {"prob": 0.15, "from_step": 1099, "every_steps": 100},
     "plays_on_when_empty": True,
 }
-_OPEN_RULES: Final[dict[str, Any]] = _MELTING_POT | {
+_OPEN_RULES: Final[dict[str, Any]] = _MELTING_POT_RULES | {
     "regrow_prob": (0.0, 0.0025, 0.005, 0.025),
     "beam_length_cells": 3,
     "cooldown_steps": 2,
     "freeze_steps": 5,
 }
-_SSD: Final[dict[str, Any]] = {
+_SSD_RULES: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.005, 0.02, 0.05),
     "regrow_radius_cells": 1.5,
     "regrow_under_agents": False,
@@ -159,13 +160,13 @@ _SSD: Final[dict[str, Any]] = {
     "window_columns": 15,
     "plays_on_when_empty": True,
 }
-_CLEANUP_RULES: Final[dict[str, Any]] = _SSD | {
+_CLEANUP_RULES: Final[dict[str, Any]] = _SSD_RULES | {
     "regrow_prob": (0.05,),
     "regrow_radius_cells": 0,
     "first_stock_share": 0.0,
     "river": {"may_clean": True, "pollution_prob": 0.5},
 }
-_SOCIALJAX: Final[dict[str, Any]] = {
+_SOCIALJAX_RULES: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.001, 0.005, 0.025),
     "regrow_under_agents": False,
     "growth": "before_bites",
@@ -180,7 +181,7 @@ _SOCIALJAX: Final[dict[str, Any]] = {
     "window_columns": 11,
     "plays_on_when_empty": True,
 }
-_PEROLAT: Final[dict[str, Any]] = {
+_PEROLAT_RULES: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.01, 0.01, 0.05, 0.05, 0.1),
     "beam_length_cells": 10,
     "beam_width_cells": 5,
@@ -188,7 +189,7 @@ _PEROLAT: Final[dict[str, Any]] = {
     "window_columns": 21,
 }
 # A turn is an eighth of a second, the time that a person takes for a move in the laboratory.
-_JANSSEN: Final[dict[str, Any]] = {
+_JANSSEN_RULES: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.01 / 8),
     "regrow_by": "share",
     "regrow_radius_cells": 1,
@@ -202,36 +203,52 @@ _JANSSEN: Final[dict[str, Any]] = {
 }
 
 
-class Source(NamedTuple):
+class LiteratureGame(NamedTuple):
     """A game of the literature: where it comes from, and the board and rules from which it is made."""
 
-    work: str
+    citation: str
     """Authors, title and year, or the name of a program."""
     url: str
-    board: Callable[[Any], "Map"]
-    """A function that makes the board. Its argument is the module `cprl.commons.maps`, which is only imported
-    when a game is made."""
+    make_board: Callable[[], "Map"]
+    """A function that makes the board."""
     rules: Mapping[str, Any]
     """The fields of `Rules` that differ from their defaults."""
-    fines: Mapping[str, Any] | None = None
+    punishment: Mapping[str, Any] | None = None
     """The fields of the game's `Punishment`; None for a game without fines."""
     sees_all: bool = False
     """Whether agents observe the whole board."""
 
 
-def _open_field(maps: Any) -> "Map":
+def _drawn(drawing: str, *, legend: str, agents: int) -> "Map":
+    """Return a drawn board, see `cprl.commons.maps.parse`."""
+    from cprl.commons import maps
+
+    return maps.parse(drawing, legend=legend, agents=agents)
+
+
+def _open_field() -> "Map":
     """Return a board with the size and the number of sites of Perolat's open map, but with sites drawn by
     chance."""
-    board: Map = maps.random(20, 40, agents=12, density=246 / 800, clustering=0.8, seed=1)
-    return board
+    from cprl.commons import maps
+
+    return maps.random(20, 40, agents=12, density=246 / 800, clustering=0.8, seed=1)
 
 
-def _laboratory(maps: Any) -> "Map":
+def _rooms(entrances: "Entrances") -> "Map":
+    """Return a board of Perolat's rooms, see `cprl.commons.maps.rooms`."""
+    from cprl.commons import maps
+
+    return maps.rooms(entrances)
+
+
+def _laboratory() -> "Map":
     """Return the board of Janssen's experiment: every cell is a site, and agents start in the middle row."""
+    from cprl.commons import maps
+    from cprl.commons.headings import UP
+
     cells = tuple((row, col) for row in range(29) for col in range(29))
-    starts = tuple((14, 4 + 5 * i, maps.UP) for i in range(5))
-    board: Map = maps.Map(height=29, width=29, sites=cells, starts=starts)
-    return board
+    starts = tuple((14, 4 + 5 * agent, UP) for agent in range(5))
+    return maps.Map(height=29, width=29, sites=cells, starts=starts)
 
 
 def _without_walls(drawing: str) -> str:
@@ -240,62 +257,72 @@ def _without_walls(drawing: str) -> str:
 
 
 _SSD_URL: Final = "https://github.com/eugenevinitsky/sequential_social_dilemma_games"
-_SSD_FINES: Final = {"fine": 50.0, "cost": 0.0, "shot_cost": 1.0}
-_PEROLAT_SOURCE: Final = (
-    "J. Perolat et al., A multi-agent reinforcement learning model of common-pool resource appropriation, "
-    "NeurIPS 2017",
-    "https://arxiv.org/abs/1707.06600",
-)
+_SSD_PUNISHMENT: Final = {"fine": 50.0, "cost": 0.0, "shot_cost": 1.0}
 
 
-def _melting_pot(name: str, drawing: str, rules: Mapping[str, Any]) -> Source:
-    """Return the source of a game of Melting Pot, by the last part of its name there."""
-    return Source(
-        f"Melting Pot 2.4, commons_harvest__{name}",
-        "https://github.com/google-deepmind/meltingpot",
-        lambda maps: maps.parse(drawing, legend="melting_pot", agents=7),
-        rules,
+def _melting_pot(name: str, drawing: str, rules: Mapping[str, Any]) -> LiteratureGame:
+    """Return a game of Melting Pot, by the last part of its name there."""
+    return LiteratureGame(
+        citation=f"Melting Pot 2.4, commons_harvest__{name}",
+        url="https://github.com/google-deepmind/meltingpot",
+        make_board=partial(_drawn, drawing, legend="melting_pot", agents=7),
+        rules=rules,
     )
 
 
-SOURCES: Final[dict[str, Source]] = {
-    "melting_pot/commons_harvest__open-v1": _melting_pot("open", _OPEN, _OPEN_RULES),
-    "melting_pot/commons_harvest__closed-v1": _melting_pot("closed", _CLOSED, _MELTING_POT),
-    "melting_pot/commons_harvest__partnership-v1": _melting_pot("partnership", _PARTNERSHIP, _MELTING_POT),
-    "ssd/harvest-v1": Source(
-        "sequential_social_dilemma_games, HarvestEnv",
-        _SSD_URL,
-        lambda maps: maps.parse(_HARVEST, legend="ssd", agents=5),
-        _SSD,
-        _SSD_FINES,
+def _perolat(make_board: Callable[[], "Map"]) -> LiteratureGame:
+    """Return a game of Perolat et al. on a board."""
+    return LiteratureGame(
+        citation=(
+            "J. Perolat et al., A multi-agent reinforcement learning model of common-pool resource "
+            "appropriation, NeurIPS 2017"
+        ),
+        url="https://arxiv.org/abs/1707.06600",
+        make_board=make_board,
+        rules=_PEROLAT_RULES,
+    )
+
+
+LITERATURE_GAMES: Final[dict[str, LiteratureGame]] = {
+    "melting_pot/commons_harvest__open-v1": _melting_pot("open", _OPEN_BOARD, _OPEN_RULES),
+    "melting_pot/commons_harvest__closed-v1": _melting_pot("closed", _CLOSED_BOARD, _MELTING_POT_RULES),
+    "melting_pot/commons_harvest__partnership-v1": _melting_pot(
+        "partnership", _PARTNERSHIP_BOARD, _MELTING_POT_RULES
     ),
-    "ssd/cleanup-v1": Source(
-        "sequential_social_dilemma_games, CleanupEnv",
-        _SSD_URL,
-        lambda maps: maps.parse(_CLEANUP, legend="ssd_cleanup", agents=5),
-        _CLEANUP_RULES,
-        _SSD_FINES,
+    "ssd/harvest-v1": LiteratureGame(
+        citation="sequential_social_dilemma_games, HarvestEnv",
+        url=_SSD_URL,
+        make_board=partial(_drawn, _HARVEST_BOARD, legend="ssd", agents=5),
+        rules=_SSD_RULES,
+        punishment=_SSD_PUNISHMENT,
     ),
-    "socialjax/harvest_open-v1": Source(
-        "SocialJax, harvest_open",
-        "https://github.com/cooperativex/SocialJax",
-        lambda maps: maps.parse(_without_walls(_OPEN), legend="socialjax", agents=7),
-        _SOCIALJAX,
+    "ssd/cleanup-v1": LiteratureGame(
+        citation="sequential_social_dilemma_games, CleanupEnv",
+        url=_SSD_URL,
+        make_board=partial(_drawn, _CLEANUP_BOARD, legend="ssd_cleanup", agents=5),
+        rules=_CLEANUP_RULES,
+        punishment=_SSD_PUNISHMENT,
     ),
-    "perolat/open-v1": Source(*_PEROLAT_SOURCE, _open_field, _PEROLAT),
-    "perolat/rooms-v1": Source(*_PEROLAT_SOURCE, lambda maps: maps.rooms("single"), _PEROLAT),
-    "perolat/rooms_many_entrances-v1": Source(
-        *_PEROLAT_SOURCE, lambda maps: maps.rooms("multiple"), _PEROLAT
+    "socialjax/harvest_open-v1": LiteratureGame(
+        citation="SocialJax, harvest_open",
+        url="https://github.com/cooperativex/SocialJax",
+        make_board=partial(_drawn, _without_walls(_OPEN_BOARD), legend="socialjax", agents=7),
+        rules=_SOCIALJAX_RULES,
     ),
-    "perolat/rooms_unequal-v1": Source(*_PEROLAT_SOURCE, lambda maps: maps.rooms("unequal"), _PEROLAT),
-    "perolat/rooms_without_walls-v1": Source(*_PEROLAT_SOURCE, lambda maps: maps.rooms("none"), _PEROLAT),
-    "janssen/foraging-v1": Source(
-        "M. A. Janssen, R. Holahan, A. Lee and E. Ostrom, Lab experiments for the study of social-ecological "
-        "systems, Science 328, 2010",
-        "https://doi.org/10.1126/science.1183532",
-        _laboratory,
-        _JANSSEN,
-        {"fine": 2.0, "cost": 1.0},
+    "perolat/open-v1": _perolat(_open_field),
+    "perolat/rooms-v1": _perolat(partial(_rooms, "single")),
+    "perolat/rooms_many_entrances-v1": _perolat(partial(_rooms, "multiple")),
+    "perolat/rooms_unequal-v1": _perolat(partial(_rooms, "unequal")),
+    "perolat/rooms_without_walls-v1": _perolat(partial(_rooms, "none")),
+    "janssen/foraging-v1": LiteratureGame(
+        citation=(
+            "M. A. Janssen, R. Holahan, A. Lee and E. Ostrom, Lab experiments for the study of "
+            "social-ecological systems, Science 328, 2010"
+        ),
+        url="https://doi.org/10.1126/science.1183532",
+        make_board=_laboratory,
+        rules=_JANSSEN_RULES,
+        punishment={"fine": 2.0, "cost": 1.0},
         sees_all=True,
     ),
 }
@@ -303,21 +330,22 @@ SOURCES: Final[dict[str, Source]] = {
 
 
 def game_of_literature(name: str) -> "Game":
-    """Return a game of the literature by its name, one of `SOURCES`."""
-    from cprl.commons import maps
+    """Return a game of the literature by its name, one of `LITERATURE_GAMES`."""
     from cprl.commons.game import Game
     from cprl.commons.observation import Area, Observation
     from cprl.commons.river import River
     from cprl.commons.rules import RandomEnd, Rules
     from cprl.institutions import Punishment
 
-    source = SOURCES[name]
-    rules = dict(source.rules)
+    entry = LITERATURE_GAMES[name]
+    rules = dict(entry.rules)
     for group, kind in {"river": River, "random_end": RandomEnd}.items():
         if group in rules:
             rules[group] = kind(**rules[group])
-    fines = (Punishment(**source.fines),) if source.fines else ()
-    area: Area = "full" if source.sees_all else "window"
+    area: Area = "full" if entry.sees_all else "window"
     return Game(
-        map=source.board(maps), rules=Rules(**rules), observation=Observation(area=area), institutions=fines
+        map=entry.make_board(),
+        rules=Rules(**rules),
+        observation=Observation(area=area),
+        institutions=(Punishment(**entry.punishment),) if entry.punishment else (),
     )

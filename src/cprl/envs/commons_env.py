@@ -144,14 +144,13 @@ class CommonsEnv(LeanStepEnv):
             for name, count in choice_counts.items()
         }
         rules = {}
-        if game.governor is not None:
-            options = len(game.governor.options)
-            rules[keys.RULE] = Categorical(options, shape=(self._world_count,), dtype=torch.int64)
-        self.action_spec = self._group_spec(choices, **rules)
         root_specs = self._entry_specs(self._world_entries)
         if game.governor is not None:
-            seen = self._world_count, len(game.governor.sees)
-            root_specs[keys.SEEN] = Unbounded(shape=seen, dtype=torch.float32)
+            options = len(game.governor.options)
+            rules[keys.RULE] = Categorical(options, shape=self.batch_size, dtype=torch.int64)
+            features = len(game.governor.sees)
+            root_specs[keys.SEEN] = Unbounded(shape=(*self.batch_size, features), dtype=torch.float32)
+        self.action_spec = self._group_spec(choices, **rules)
         if self._has_state:
             board = self._world_count, 3, game.map.height, game.map.width
             root_specs[keys.STATE] = Bounded(0, 255, shape=board, dtype=torch.uint8)

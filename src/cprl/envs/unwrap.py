@@ -3,6 +3,7 @@
 from torchrl.envs import EnvBase, TransformedEnv
 
 from cprl import keys
+from cprl.commons.game import Game
 from cprl.envs.commons_env import CommonsEnv
 
 
@@ -17,6 +18,12 @@ def commons_of(env: EnvBase) -> CommonsEnv | None:
     """Return the `CommonsEnv` under the transforms, or None for an environment of another game."""
     base = base_env(env)
     return base if isinstance(base, CommonsEnv) else None
+
+
+def commons_game_of(env: EnvBase) -> Game | None:
+    """Return the `cprl.Game` that an environment plays, or None for another game."""
+    commons = commons_of(env)
+    return None if commons is None else commons.game
 
 
 def clock_of(env: EnvBase) -> int | None:

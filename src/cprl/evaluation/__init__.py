@@ -7,6 +7,7 @@ Modules, in the order in which one reads them:
     cross_play      crossplay: one focal agent of a run among background agents of another run
     scenarios       run_scenarios: agents of a run among named backgrounds that they never met
     fresh           one fresh episode of a run to be filmed or shown, by default a typical one
+    video_files     pictures as a GIF or an MP4
     film            an episode as a recording for the viewer, or as a GIF or MP4
     play            an episode in which a person plays among trained or scripted agents
 """

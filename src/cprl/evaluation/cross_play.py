@@ -42,7 +42,7 @@ from cprl.values import checked, refusal
 
 _SELF_PLAY: Final = -1
 """The value of "focal_agent" in rows of self-play, in which every agent is both focal and background."""
-PAIR: Final = (FOCAL, BACKGROUND)
+CELL_LABELS: Final = (FOCAL, BACKGROUND)
 """The labels of a cell: the names of the focal agent's run and of the background agents' run."""
 FOCAL_RETURN: Final = "focal/return"
 BACKGROUND_RETURN: Final = "background/return"
@@ -148,7 +148,7 @@ def gains(table: pa.Table) -> Family:
     def diagonal(cell: Mapping[str, str]) -> dict[str, str]:
         return {FOCAL: cell[BACKGROUND]}
 
-    return differences(table, [FOCAL_RETURN, BACKGROUND_RETURN], PAIR, diagonal)
+    return differences(table, [FOCAL_RETURN, BACKGROUND_RETURN], CELL_LABELS, diagonal)
 
 
 def by_focal_agent(table: pa.Table) -> pa.Table:
@@ -176,7 +176,7 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
     from 0 by Holm's method for all drawn gains.
     """
     gained = gains(table)
-    returns = estimates(table, FOCAL_RETURN, PAIR).column(FOCAL_RETURN)
+    returns = estimates(table, FOCAL_RETURN, CELL_LABELS).column(FOCAL_RETURN)
     self_play = {pair: f"{returns[pair].value:.3g}" for pair in returns if pair[0] == pair[1]}
     unit = f", {rewards_of(table)}".removesuffix(", ")
     diagonal = table_note(table, "diagonal").replace("_", "-")
@@ -214,9 +214,9 @@ def crossplay_tables(table: pa.Table) -> Iterator[TextTable]:
     metrics = dict.fromkeys([*CROSS_PLAY_RETURNS, *all_metrics(table)])
     if FINES_TOTAL not in table.column_names:  # without fines the collective return equals the income
         metrics.pop(COLLECTIVE_RETURN, None)
-    levels = estimates(table, list(metrics), PAIR)
+    levels = estimates(table, list(metrics), CELL_LABELS)
     for metric in metrics:
         if not is_empty_row(metric, levels):
             yield matrix_table(levels, metric, with_unit(metric, rewards=rewards))
-    by_agent = estimates(by_focal_agent(table), CROSS_PLAY_RETURNS, (*PAIR, "focal_agent"))
+    by_agent = estimates(by_focal_agent(table), CROSS_PLAY_RETURNS, (*CELL_LABELS, "focal_agent"))
     yield row_table(by_agent, "returns by the focal agent's index", rewards=rewards)

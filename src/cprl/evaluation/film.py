@@ -1,19 +1,14 @@
 """Films an episode of stored agents: as a recording for the viewer, or as a GIF or MP4 of several runs."""
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
-from itertools import chain, pairwise
+from itertools import pairwise
 from math import ceil
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
-from PIL import Image
-from scipy.spatial.distance import cdist
 
 from cprl.envs.unwrap import commons_of
 from cprl.evaluation.fresh import (
@@ -24,6 +19,7 @@ from cprl.evaluation.fresh import (
     record,
 )
 from cprl.evaluation.populations import commons_game
+from cprl.evaluation.video_files import check_can_write_mp4, write_gif, write_mp4
 from cprl.measuring.playing import turns
 from cprl.measuring.series import Observer
 from cprl.measuring.tracker import Episode, tracker_of
@@ -35,7 +31,7 @@ from cprl.pictures.episode_picture import (
     note,
 )
 from cprl.pictures.readable import capitalised, growth_of, in_lower_case, legend_of
-from cprl.runs.files import refuse_to_write_over, write_atomically
+from cprl.runs.files import refuse_to_write_over
 from cprl.system.defaults import FILM_SUFFIXES
 from cprl.system.output import legible
 from cprl.system.working import working
@@ -47,7 +43,7 @@ from cprl.viewer.replay_views import Decisions, ViolationMarks, events
 
 
 @working("making a film")
-def film(
+def record_episode(
     run: str | Path,
     out: str | Path | None = None,
     *,
@@ -73,10 +69,11 @@ def film(
 
     Raises:
         FileExistsError: if the recording exists.
+        ValueError: for another kind of file, or a replica, episode or seed that `fresh_episodes` refuses.
     """
     if out is not None:
         if Path(out).suffix != ".rrd":
-            raise refusal("out", str(out), "a .rrd; film_video makes a .gif or an .mp4")
+            raise refusal("out", str(out), "a .rrd; film_episode makes a .gif or an .mp4")
         refuse_to_write_over(Path(out))
     (fresh,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed)
     default_path = Path(run) / f"film-{fresh.replica}-{fresh.episode}.rrd"
@@ -147,23 +144,24 @@ class Style(Value, stored=False):
     titles: tuple[str, ...] = ()
     """The title of each run; by default the institutions of the runs, or the names of their experiments."""
     every: Positive | None = None
-    """The number of turns between two pictures; by default 1 for an .mp4, and for a .gif as many as give 300
-    pictures."""
+    """The number of turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many as
+    give at most `_GIF_FRAMES` pictures."""
     fps: Fps = DEFAULT_FPS
     """The pictures per second. In a .gif a picture lasts a whole number of hundredths of a second."""
     width: Positive | None = None
-    """The width of the film in pixels, at most 1920 and at least 240 for each run; by default 640 for each
-    run, if that fits. The height follows from the boards, which are at most twice as high as wide."""
+    """The width of the film in pixels, at most `LARGEST_WIDTH` and at least `SMALLEST_WIDTH` for each run; by
+    default `DEFAULT_WIDTH` for each run, if that fits. The height follows from the boards, which are at most
+    twice as high as wide."""
 
     def width_of_each(self, runs: int) -> int:
-        """Return the width of the panel of each run, in pixels."""
+        """Return the width of the panel of each run, in pixels; refuse a width that does not fit them."""
         width = min(LARGEST_WIDTH, DEFAULT_WIDTH * runs) if self.width is None else self.width
         allowed = Annotated[int, Range(SMALLEST_WIDTH * runs, LARGEST_WIDTH)]
         return int(checked("width", width, allowed)) // runs
 
 
 @working("making a film")
-def film_video(
+def film_episode(
     run: str | Path,
     out: str | Path,
     *,
@@ -180,8 +178,8 @@ def film_video(
     seconds; a note below explains the signs. Agents that broke a rule since the last picture have a white
     diamond around them. All panels show the same turn; a panel whose episode is over waits for the others.
 
-    The episode is the one that `cprl.evaluation.film.film` records with the same numbers. The first and the
-    last board are always in the film.
+    The episode is the one that `record_episode` records with the same numbers. The first and the last board
+    are always in the film.
 
     Args:
         run: the run's directory.
@@ -199,42 +197,50 @@ def film_video(
     Raises:
         FileExistsError: if the film exists.
         ModuleNotFoundError: for an .mp4 without imageio-ffmpeg.
+        ValueError: for another kind of file, too many runs, titles that do not fit them, or a replica,
+            episode or seed that `fresh_episodes` refuses.
     """
     path = Path(out)
-    if path.suffix not in FILM_SUFFIXES:
-        raise refusal("out", str(path), f"a file whose name ends in {' or '.join(FILM_SUFFIXES)}")
+    is_mp4 = path.suffix == ".mp4"
     runs = (run, *beside)
+    _check_path(path)
     check_beside(runs, style.titles, most=LARGEST_WIDTH // SMALLEST_WIDTH)
     width = style.width_of_each(len(runs))
-    refuse_to_write_over(path)
-    if path.suffix == ".mp4":
-        check_can_write_mp4(path)
-    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
-    print_descriptions(fresh)
-    panels = _panels(fresh, style.titles or titles_of(fresh), width)
-    length = max(len(panel.played.boards) for panel in panels)
-    every = style.every or (1 if path.suffix == ".mp4" else ceil(length / _GIF_FRAMES))
-    filmed_turns = sorted({*range(0, length, every), length - 1})
-
-    def draw(turns: Sequence[int]) -> Iterator[UInt8]:
-        """Yield the pictures after these turns, and the end card."""
-        for previous, turn in pairwise((-1, *turns)):
-            yield join_panels([panel.draw(turn, since=previous + 1) for panel in panels])
-        yield join_panels([panel.draw(length, since=length, card=True) for panel in panels])
-
-    def join_panels(pictures: Sequence[UInt8]) -> UInt8:
-        return np.concatenate([np.concatenate(pictures, 1), legend], 0)
-
-    games = [commons_game(population.run) for population in fresh]
+    episodes = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
+    print_descriptions(episodes)
+    panels = _panels(episodes, style.titles or titles_of(episodes), width)
+    last = max(panel.played.last for panel in panels)
+    every = style.every or (1 if is_mp4 else ceil((last + 1) / _GIF_FRAMES))
+    filmed_turns = sorted({*range(0, last, every), last})
+    games = [commons_game(fresh.run) for fresh in episodes]
     film_width = sum(panel.picture.size[0] for panel in panels)
     legend = note(f"{growth_of(games[0])} {legend_of(games)}", film_width)
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".mp4":
-        write_mp4(path, draw(filmed_turns), fps=style.fps)
+    pictures = _pictures(panels, filmed_turns, legend)
+    if is_mp4:
+        write_mp4(path, pictures, fps=style.fps)
     else:
-        samples = list(draw(filmed_turns[:: ceil(len(filmed_turns) / _PALETTE_SAMPLES)]))
-        write_gif(path, draw(filmed_turns), samples, fps=style.fps)
+        sampled_turns = filmed_turns[:: ceil(len(filmed_turns) / _PALETTE_SAMPLES)]
+        write_gif(path, pictures, list(_pictures(panels, sampled_turns, legend)), fps=style.fps)
     return path, tuple(panel.played.episode for panel in panels)
+
+
+def _check_path(path: Path) -> None:
+    """Refuse a film that exists, or is neither a GIF nor an MP4, or cannot be written here."""
+    if path.suffix not in FILM_SUFFIXES:
+        raise refusal("out", str(path), f"a file whose name ends in {' or '.join(FILM_SUFFIXES)}")
+    refuse_to_write_over(path)
+    if path.suffix == ".mp4":
+        check_can_write_mp4(path)
+
+
+def _pictures(panels: Sequence["_Panel"], filmed_turns: Sequence[int], legend: UInt8) -> Iterator[UInt8]:
+    """Yield the pictures after these turns, and the end card: the panels side by side, the legend below."""
+    for previous, turn in pairwise((-1, *filmed_turns)):
+        yield np.vstack([np.hstack([panel.draw(turn, since=previous + 1) for panel in panels]), legend])
+    after_end = max(len(panel.played.boards) for panel in panels)
+    end_cards = [panel.draw(after_end, since=after_end, is_end_card=True) for panel in panels]
+    yield np.vstack([np.hstack(end_cards), legend])
 
 
 def check_beside(runs: Sequence[str | Path], titles: Sequence[str], *, most: int) -> None:
@@ -245,19 +251,20 @@ def check_beside(runs: Sequence[str | Path], titles: Sequence[str], *, most: int
         raise refusal("titles", titles, f"a line of text for each of {len(runs)} runs")
 
 
-def titles_of(fresh: Sequence[FreshEpisode]) -> Sequence[str]:
+def titles_of(episodes: Sequence[FreshEpisode]) -> Sequence[str]:
     """Return titles that distinguish the runs.
 
     They are the runs' institutions and transforms; if some of these are equal, the names of the experiments;
     and if some of these are equal too, the names of the directories.
     """
-    rules = [in_lower_case(" and ".join(_rules_in(population.run))) for population in fresh]
-    names = [population.run.experiment.name.replace("_", " ") for population in fresh]
+    runs = [fresh.run for fresh in episodes]
+    rules = [in_lower_case(" and ".join(_rules_in(run))) for run in runs]
+    names = [run.experiment.name.replace("_", " ") for run in runs]
     titles = [rule or "no rule" for rule in rules] if any(rules) else names
     for candidates in (titles, names):
-        if len(set(candidates)) == len(fresh):
+        if len(set(candidates)) == len(runs):
             return list(map(capitalised, candidates))
-    return [legible(population.run.path.resolve().name) for population in fresh]
+    return [legible(run.path.resolve().name) for run in runs]
 
 
 def _rules_in(run: LoadedRun) -> list[str]:
@@ -276,111 +283,46 @@ class _Panel(NamedTuple):
     is_typical: bool
     """Whether the episode was chosen as a typical one."""
 
-    def draw(self, turn: int, *, since: int, card: bool = False) -> UInt8:
+    def draw(self, turn: int, *, since: int, is_end_card: bool = False) -> UInt8:
         """Return the picture after a turn, or after the last turn if the episode is over.
 
         Args:
+            turn: the turn; 0 is the start.
             since: the first turn whose violations are marked.
-            card: whether to draw the card that says how the episode ended.
+            is_end_card: whether to draw the card that says how the episode ended.
         """
         played = self.played
-        death = ""
-        if played.is_dead:
-            death = f"gone for good at turn {played.last:,} of {self.picture.steps:,}"
-        outcome = death or f"{played.left:,} of {len(self.picture.board.sites):,} still on the board"
-        count = int(played.boards[-1].harvested.sum())
-        apples = f"{count:,} apple{'s' * (count != 1)} picked"
+        apples, outcome = self._outcome_texts()
         subject = "A typical episode" if self.is_typical else "This episode"
-        end = death if turn >= played.last else ""
-        card_text = f"{apples} · {outcome}" if card else ""
+        has_died = played.is_dead and turn >= played.last
         return self.picture.draw(
             played.boards[: turn + 1],
             self.title,
-            comes_to=f"{subject}: {apples}, {outcome}",
-            end=end,
-            card=card_text,
+            headline=f"{subject}: {apples}, {outcome}",
+            end=outcome if has_died else "",
+            card=f"{apples} · {outcome}" if is_end_card else "",
             violators=np.flatnonzero(played.violated[since : turn + 1].any(0)).tolist(),
         )
 
+    def _outcome_texts(self) -> tuple[str, str]:
+        """Return how many apples were picked, and what became of the board."""
+        played = self.played
+        count = int(played.boards[-1].harvested.sum())
+        apples = f"{count:,} apple{'s' * (count != 1)} picked"
+        if played.is_dead:
+            return apples, f"gone for good at turn {played.last:,} of {self.picture.steps:,}"
+        return apples, f"{played.left:,} of {len(self.picture.board.sites):,} still on the board"
 
-def _panels(fresh: Sequence[FreshEpisode], titles: Sequence[str], width: int) -> list[_Panel]:
+
+def _panels(episodes: Sequence[FreshEpisode], titles: Sequence[str], width: int) -> list[_Panel]:
     """Play the episodes and return their panels, all of the same size and with the same axis of harvests."""
-    games = [commons_game(population.run) for population in fresh]
-    episodes = [record(population) for population in fresh]
-    most_harvested = max(int(played.boards[-1].harvested.max()) for played in episodes)
+    games = [commons_game(fresh.run) for fresh in episodes]
+    recorded = [record(fresh) for fresh in episodes]
+    most_harvested = max(int(played.boards[-1].harvested.max()) for played in recorded)
     height = max(EpisodePicture(game.map, steps=1, width=width).size[1] for game in games)
     sizes = {"width": width, "height": height, "most_harvested": most_harvested}
     panels = []
-    for title, population, game, played in zip(titles, fresh, games, episodes, strict=True):
+    for title, fresh, game, played in zip(titles, episodes, games, recorded, strict=True):
         picture = EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes)
-        panels.append(_Panel(title, picture, played, population.is_typical))
+        panels.append(_Panel(title, picture, played, fresh.is_typical))
     return panels
-
-
-HOLD_S: Final = 2.0
-"""The seconds for which the last picture is shown."""
-
-_GIF_COLOURS: Final = 127
-"""The number of colours in a GIF. With one more for unchanged pixels, a pixel takes at most seven bits."""
-
-
-def check_can_write_mp4(path: Path) -> None:
-    """Raise a ModuleNotFoundError with the command to install imageio-ffmpeg if it is not installed."""
-    if find_spec("imageio_ffmpeg") is None:
-        raise ModuleNotFoundError(
-            f"{path}: an .mp4 needs imageio-ffmpeg, which is not installed; "
-            'run pip install "cprl[film]", or name a .gif'
-        )
-
-
-def write_gif(path: Path, pictures: Iterable[UInt8], samples: Sequence[UInt8], *, fps: float) -> None:
-    """Write a GIF that repeats, with one palette for all pictures.
-
-    Args:
-        pictures: the pictures, uint8 [height, width, 3] each, RGB.
-        samples: some of the pictures, whose most frequent colours are the palette; any other colour becomes
-            the nearest of these.
-        fps: the pictures per second, rounded so that a picture lasts whole hundredths of a second.
-    """
-    counts: Any = Image.fromarray(np.concatenate(samples)).getcolors(2**24)
-    known = np.array([colour for _, colour in sorted(counts, reverse=True)[:_GIF_COLOURS]])
-    palette = known.astype(np.uint8).tobytes() + bytes(3)
-    index = np.full(2**24, -1, np.int16)
-
-    def indexed(picture: UInt8) -> Image.Image:
-        # Pillow's own quantize treats colours as equal that differ by up to 4.
-        packed = picture @ np.array([1 << 16, 1 << 8, 1], np.int32)
-        new = np.unique(packed[index[packed] < 0])
-        index[new] = cdist(np.stack([new >> 16, new >> 8 & 255, new & 255], -1), known).argmin(1)
-        image = Image.fromarray(index[packed].astype(np.uint8), "P")
-        image.putpalette(palette)
-        return image
-
-    first, *others = map(indexed, pictures)
-    options = {
-        "append_images": others,
-        "duration": [10 * max(2, round(100 / fps))] * len(others) + [round(1000 * HOLD_S)],
-        "palette": palette,
-        "transparency": len(known),
-    }
-    write_atomically(
-        path, lambda file: first.save(file, format="GIF", save_all=True, loop=0, optimize=True, **options)
-    )
-
-
-def write_mp4(path: Path, pictures: Iterator[UInt8], *, fps: float) -> None:
-    """Write an MP4, whose last picture is shown for `HOLD_S` seconds."""
-    from imageio_ffmpeg import write_frames
-
-    look: Any = {"codec": "libx264", "quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error"}
-    first = next(pictures)
-    height, width, _ = first.shape
-    with TemporaryDirectory() as folder:
-        partial = Path(folder) / "film.mp4"
-        with closing(write_frames(partial, (width, height), fps=fps, **look)) as video:
-            video.send(None)
-            for picture in chain([first], pictures):
-                video.send(np.ascontiguousarray(picture))
-            for _ in range(round(HOLD_S * fps) - 1):
-                video.send(np.ascontiguousarray(picture))
-        write_atomically(path, lambda file: file.write(partial.read_bytes()))

@@ -50,7 +50,8 @@ def matrix_table(family: Family, metric: str, title: str, note: str = "") -> Tex
     """
     row_labels, column_labels = matrix_labels(family)
     estimates = family.column(metric)
-    cells = {pair: Change(estimate) if family.name else estimate for pair, estimate in estimates.items()}
+    has_tests = family.tests is not None
+    cells = {pair: Change(estimate) if has_tests else estimate for pair, estimate in estimates.items()}
     rows: list[list[TableCell]] = []
     for row_label in row_labels:
         row_cells = [cells.get((row_label, column_label), "") for column_label in column_labels]

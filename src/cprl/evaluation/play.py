@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import pyarrow.compute as pc
@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase
 from cprl import keys
 from cprl.commons import maps
 from cprl.commons.game import Game
-from cprl.commons.published import Variant, check_board
+from cprl.commons.named_games import Variant, check_game_source
 from cprl.commons.rules import Rules
 from cprl.commons.world import StepOutput, WorldView
 from cprl.envs.make_env import make_env
@@ -25,7 +25,7 @@ from cprl.measuring import social
 from cprl.measuring.playing import Policy, turns
 from cprl.measuring.table import where
 from cprl.policies.scripted import SCRIPTED_POLICIES
-from cprl.population import Scripted
+from cprl.population import AgentSpec, Scripted
 from cprl.runs.episodes import read_rows
 from cprl.system.defaults import PLAY_SEED
 from cprl.system.working import working
@@ -42,16 +42,27 @@ class Session:
         others: the policy of all agents; the action of the person's agent is replaced.
         agent: the index of the person's agent.
         decision: the person's vote, see `Game.decisions`; None for the vote that `others` choose.
+        about_others: sentences about the other agents.
+        average_harvest_text: a sentence about the apples that this agent gets on average in an episode; "" if
+            they are unknown.
+
+    Raises:
+        ValueError: for an environment that is not of the commons, or a decision that agents cannot make.
     """
 
-    about_others: str = ""
-    """Sentences about the other agents."""
-    usual: str = ""
-    """A sentence about the apples that this agent gets on average in an episode; "" if they are unknown."""
-
-    def __init__(self, env: EnvBase, others: Policy, *, agent: int = 0, decision: int | None = None) -> None:
+    def __init__(
+        self,
+        env: EnvBase,
+        others: Policy,
+        *,
+        agent: int = 0,
+        decision: int | None = None,
+        about_others: str = "",
+        average_harvest_text: str = "",
+    ) -> None:
         commons = commons_of(env)
-        assert commons is not None
+        if commons is None:
+            raise refusal("env", type(env).__name__, "a CommonsEnv, with or without transforms")
         self._commons = commons
         self._others = others
         self.game = commons.game
@@ -62,16 +73,18 @@ class Session:
                 raise refusal("decision", decision, "None: agents decide nothing in this game")
             checked("decision", decision, Annotated[int, Range(0, self.game.decisions - 1)])
         self._decision = decision
+        self.about_others = about_others
+        self.average_harvest_text = average_harvest_text
         self._action = 0
         self._turns = turns(env, self._choose)
         self._played: list[TensorDictBase] = []
-        self.moments: list[WorldView] = [board_now(self._commons)]
+        self.boards: list[WorldView] = [board_now(self._commons)]
         """The board at the start of the episode and after each turn."""
 
     @property
     def turn(self) -> int:
         """Return the number of turns that have been played."""
-        return len(self.moments) - 1
+        return len(self.boards) - 1
 
     @property
     def has_ended(self) -> bool:
@@ -81,18 +94,21 @@ class Session:
     @property
     def harvested(self) -> list[int]:
         """Return the apples that each agent has harvested so far."""
-        return list(map(int, self.moments[-1].harvested))
+        return list(map(int, self.boards[-1].harvested))
 
     @property
     def stock(self) -> int:
         """Return the number of apples on the board."""
-        return int(self.moments[-1].stock.sum(dtype=np.int64))
+        return int(self.boards[-1].stock.sum(dtype=np.int64))
 
     def act(self, action: str) -> StepOutput:
-        """Play a turn in which the person's agent takes this action.
+        """Play a turn in which the person's agent takes this action, one of `Game.actions`.
 
         Returns:
             The output of the turn; the next turn overwrites it.
+
+        Raises:
+            ValueError: for an unknown action, or after the end of the episode.
         """
         if action not in self.game.actions:
             raise refusal("action", action, ", ".join(self.game.actions))
@@ -100,7 +116,7 @@ class Session:
             raise ValueError("the episode has ended; allowed: turns up to its end")
         self._action = self.game.actions.index(action)
         self._played.append(next(self._turns))
-        self.moments.append(board_now(self._commons))
+        self.boards.append(board_now(self._commons))
         return self._commons.output
 
     def metrics(self) -> dict[str, float]:
@@ -114,8 +130,9 @@ class Session:
         measured = social.summary(harvest, torch.cat([batch[keys.IN_PLAY] for batch in self._played]))
         return {**{name: float(value) for name, value in measured.items()}, "stock_left": float(self.stock)}
 
-    def _choose(self, moment: TensorDictBase) -> TensorDictBase:
-        chosen = self._others(moment)
+    def _choose(self, observed: TensorDictBase) -> TensorDictBase:
+        """Replace the person's action, and vote if given, in what the others' policy chooses."""
+        chosen = self._others(observed)
         for key, value in ((keys.ACTION, self._action), (keys.DECISION, self._decision)):
             if value is not None:
                 values = chosen[key].clone()
@@ -124,30 +141,71 @@ class Session:
         return chosen
 
 
-def board_named(board: str, variant: Variant) -> tuple[Game, LoadedRun | None]:
-    """Return the game that a name stands for, and its run if the name is a run's directory.
+def game_and_run(source: str, variant: Variant) -> tuple[Game, LoadedRun | None]:
+    """Return the game that a word stands for, and its run if the word is a run's directory.
 
     Args:
-        board: the name of a published board; the directory of a run; or a file with a drawing of a board, see
-            `cprl.maps.parse`, which is played by the published rules.
-        variant: the variant of a published board.
+        source: the name of a game, see `cprl.presets.game`; the directory of a run; or a file with a drawing
+            of a board, see `cprl.maps.parse`, which is played by the published rules.
+        variant: the variant of a published game.
+
+    Raises:
+        ValueError: for a word that stands for no game, or a variant that the game lacks.
     """
     checked("variant", variant, Variant)
-    check_board(board)
-    if board in presets.names():
-        return presets.game(board, variant=variant), None
+    check_game_source(source)
+    if source in presets.names():
+        return presets.game(source, variant=variant), None
     if variant != "published":
-        raise refusal("variant", variant, f'"published" with {board}, which names no preset')
-    path = Path(board)
+        raise refusal("variant", variant, f'"published" with {source}, which names no preset')
+    path = Path(source)
     if path.is_dir():
         run = load(path)
         return commons_game(run), run
     return Game(map=maps.read_file(path), rules=Rules()), None
 
 
+class _Others(NamedTuple):
+    """The agents among which a person plays."""
+
+    name: str
+    """The name of a scripted policy, or the directory of a run."""
+    run: LoadedRun | None
+    """The run whose agents they are; None for scripted agents."""
+    replica: int
+    """The replica of the run; 0 for scripted agents."""
+
+    def specs(self, agents: int) -> list[AgentSpec]:
+        """Return the specification of each of N agents, the person's index included."""
+        return [agent_named(self.name, agent, replica=self.replica, name="others") for agent in range(agents)]
+
+    @property
+    def in_words(self) -> str:
+        """Return sentences about a run's agents; "" for scripted ones."""
+        if self.run is None:
+            return ""
+        return f"The others are of replica {self.replica}. {averages_in_words(self.run)}".rstrip()
+
+
+def _others_from(others: str | None, game_source: str, run: LoadedRun | None, replica: int | None) -> _Others:
+    """Return the other agents; `run` is that of `game_source`, if this is the directory of a run."""
+    name = others or ("greedy" if run is None else game_source)
+    if name in SCRIPTED_POLICIES:
+        if replica is not None:
+            raise ValueError(
+                f'replica is {replica}, and others is "{name}"; allowed: with the agents of a run'
+            )
+        return _Others(name, None, 0)
+    if name != game_source:
+        run = load(name) if Path(name).is_dir() else None
+    if replica is None:
+        replica = 0 if run is None else typical_replica(run)
+    return _Others(name, run, replica)
+
+
 @working("preparing an episode")
 def open_session(
-    board: str,
+    game_source: str,
     *,
     agent: int = 0,
     others: str | None = None,
@@ -160,59 +218,53 @@ def open_session(
     """Begin an episode for a person and other agents.
 
     Args:
-        board: the game, see `board_named`.
+        game_source: the game, see `game_and_run`.
         agent: the index of the person's agent.
         others: the other agents: the directory of a run, whose agents play at their indices, or the name of a
-            scripted policy. By default the agents of the run that `board` names, or else "greedy".
+            scripted policy. By default the agents of the run that `game_source` names, or else "greedy".
         replica: the number of the run's replica whose agents play; by default a typical one, see
             `cprl.evaluation.fresh.typical_replica`.
-        variant: the variant of a published board.
+        variant: the variant of a published game.
         steps: the largest number of turns, in place of that of the game.
         seed: the seed of all random choices, with which the others may not have been trained; by default
             40011, or the next seed that differs from theirs. The same seed and the same actions give the same
             episode.
         decision: the person's vote in a game with votes or elections, 0 to `Game.decisions` - 1; None for a
             random vote, as scripted agents have.
+
+    Raises:
+        ValueError: for a value that the game or the run of the other agents does not have, or a seed with
+            which they were trained.
     """
-    game, run = board_named(board, variant)
-    is_game_of_run = steps is None and others in (None, board)
+    game, run = game_and_run(game_source, variant)
     if steps is not None:
         game = replace(game, rules=replace(game.rules, episode_steps=steps))
     agent = checked("agent", agent, Annotated[int, Range(0, game.agents - 1)])
-    if others is None:
-        others = "greedy" if run is None else board
-    if replica is not None and others in SCRIPTED_POLICIES:
-        raise ValueError(f'replica is {replica}, and others is "{others}"; allowed: with the agents of a run')
-    others_run = _run_of(others, board, run)
-    runs = [] if others_run is None else [others_run]
+    other_agents = _others_from(others, game_source, run, replica)
+    runs_of_others = [] if other_agents.run is None else [other_agents.run]
     if seed is None:
-        seed = fresh_seed(runs, PLAY_SEED)
-    refuse_trained_in(seed, runs)
-    if replica is None and others_run is not None:
-        replica = typical_replica(others_run)
-    specs = [agent_named(others, index, replica=replica or 0, name="others") for index in range(game.agents)]
+        seed = fresh_seed(runs_of_others, PLAY_SEED)
+    refuse_trained_in(seed, runs_of_others)
+    specs = other_agents.specs(game.agents)
     specs[agent] = Scripted("random")
     if run is None:
         env = make_env(game, seed=seed)
     else:
         env = replace(run, experiment=replace(run.experiment, game=game)).env(seed=seed)
-    population = Population(env, specs, seed=seed)
-    session = Session(env, population.policy(1), agent=agent, decision=decision)
-    if others_run is not None:
-        averages = averages_in_words(others_run)
-        session.about_others = f"The others are of replica {replica}. {averages}".rstrip()
-        session.usual = _usual_apples(others_run, agent) if is_game_of_run else ""
-    return session
+    average_harvest_text = ""
+    if run is not None and run is other_agents.run and steps is None:
+        average_harvest_text = _average_harvest_text(run, agent)
+    return Session(
+        env,
+        Population(env, specs, seed=seed).policy(1),
+        agent=agent,
+        decision=decision,
+        about_others=other_agents.in_words,
+        average_harvest_text=average_harvest_text,
+    )
 
 
-def _run_of(others: str, board: str, run: LoadedRun | None) -> LoadedRun | None:
-    """Return the run whose agents are the others; None if they are scripted."""
-    if others == board:
-        return run
-    return load(others) if others not in SCRIPTED_POLICIES and Path(others).is_dir() else None
-
-
-def _usual_apples(run: LoadedRun, agent: int) -> str:
+def _average_harvest_text(run: LoadedRun, agent: int) -> str:
     """Return a sentence about an agent's average harvest in the run's evaluation, trained and at random.
 
     Return "" if the run has no such evaluation.

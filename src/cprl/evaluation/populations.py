@@ -77,7 +77,7 @@ class FreshGame:
         """Return the game or the spaces for which policies are made, as `LoadedRun.playing`."""
         return self.game if isinstance(self.game, Game) else spaces_of(self.env())
 
-    def governor(self, replicas: Sequence[int]) -> list[StoredAgent]:
+    def governor(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
         """Return no governor: the first option of one in the game stays in force."""
         return []
 
@@ -158,15 +158,8 @@ def policies_of(
     fresh: Fresh, place: Place, agents: Sequence[AgentOfReplica], replicas: Sequence[int]
 ) -> JointPolicy:
     """Return the joint policy of all agents in the lanes of these replicas."""
-    stored = [list(map(agent, replicas)) for agent in agents]
-    return stored_policies(
-        stored,
-        place.playing,
-        replicas=replicas,
-        worlds=fresh.episodes,
-        seed=fresh.seed,
-        governor=place.governor(replicas),
-    )
+    stored = [list(map(agent, replicas)) for agent in agents] + place.governor(replicas)
+    return stored_policies(stored, place.playing, replicas=replicas, worlds=fresh.episodes, seed=fresh.seed)
 
 
 def play_fresh(

@@ -3,16 +3,16 @@
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from cprl.commons.published import (
+from cprl.commons.named_games import (
     BOARDS as BOARDS,
     GAMES as GAMES,
     VARIANTS as VARIANTS,
     Board as Board,
     Variant as Variant,
-    check_variant,
     game as game,
     names as names,
 )
+from cprl.values import checked
 
 if TYPE_CHECKING:
     from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
@@ -21,24 +21,24 @@ if TYPE_CHECKING:
 
 
 def gymnasium_env(
-    board: str, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
+    name: str, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
 ) -> "CommonsGymnasiumEnv":
     """Return a published game with one agent as a Gymnasium environment, for `gymnasium.make`."""
     from cprl.commons.maps import with_agents
     from cprl.envs.gymnasium_env import CommonsGymnasiumEnv
 
-    played = game(board, variant=variant)
+    played = game(name, variant=variant)
     alone = replace(played, map=with_agents(played.map, 1))
     return CommonsGymnasiumEnv(alone, seed=seed, render_mode=render_mode)
 
 
 def pettingzoo_env(
-    board: str, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
+    name: str, *, variant: Variant = "published", seed: int | None = None, render_mode: str | None = None
 ) -> "CommonsParallelEnv":
     """Return a published game as a PettingZoo environment, for `pettingzoo.make`."""
     from cprl.envs.pettingzoo_env import CommonsParallelEnv
 
-    return CommonsParallelEnv(game(board, variant=variant), seed=seed, render_mode=render_mode)
+    return CommonsParallelEnv(game(name, variant=variant), seed=seed, render_mode=render_mode)
 
 
 def dqn_settings(board: Board, *, variant: Variant = "published") -> "DQNSettings":
@@ -51,7 +51,8 @@ def dqn_settings(board: Board, *, variant: Variant = "published") -> "DQNSetting
     """
     from cprl.learners.settings import DQNSettings
 
-    check_variant(board, variant)
+    checked("board", board, Board)
+    checked("variant", variant, Variant)
     decay_steps = 1_000_000 if board == "commons" else 500_000
     settings = DQNSettings(gamma=0.995, epsilon_decay_steps=decay_steps)
     if variant == "published":

@@ -132,7 +132,7 @@ def current_policy(population: Population) -> CurrentPolicy:
             actors,
             population.other_actors(Purpose.EXHIBITION, worlds=1, replicas=1),
             decisions=decisions,
-            governor=None if population.governor is None else population.governor.evaluation_actor(1),
+            governor=population.governor_actor(1),
             replicas=population.replicas,
             device=population.device,
         )

@@ -29,7 +29,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.axes import Axes
 
-from cprl.evaluation.cross_play import FOCAL_RETURN, PAIR, Runs, named_runs
+from cprl.evaluation.cross_play import CELL_LABELS, FOCAL_RETURN, Runs, named_runs
 from cprl.evaluation.pages import heading, matrix_table
 from cprl.evaluation.populations import agents_of, fresh_for, join_tables, play_fresh, rotations, table_note
 from cprl.experimental.payoff_table import PayoffTable, compositions
@@ -128,7 +128,7 @@ def games_in(table: pa.Table) -> tuple[list[str], list[PayoffTable]]:
     if FOCAL in table.column_names:
         names = table[FOCAL].unique().to_pylist()
         pairs = list(product(names, repeat=2))
-        means = _values(by_replica(table, FOCAL_RETURN, PAIR), ("replica", *PAIR), "value")
+        means = _values(by_replica(table, FOCAL_RETURN, CELL_LABELS), ("replica", *CELL_LABELS), "value")
         games = []
         for replica in replicas:
             payoffs = np.array([means[replica, *pair] for pair in pairs])

@@ -36,7 +36,6 @@ from cprl.studies.study import (
     condition_name,
     directory_of,
     level_text,
-    short_names,
     unique_name,
 )
 from cprl.studies.trials import TrialOutcome, trials_of
@@ -283,12 +282,11 @@ class _Proposals:
         """Add the point of a trial of Optuna, and return it; a refused point gets the reason instead of
         raising, as later points may be valid."""
         factors = self._search.factors
-        short = short_names(self._search.factors)
         changes: dict[str, Any] = {}
         for name, factor in factors.items():
             is_drawn = isinstance(factor, Distribution)
             changes |= {name: params[name]} if is_drawn else _labelled(name, factor)[params[name]]
-        name = condition_name({short[factor]: params[factor] for factor in factors})
+        name = condition_name({factor: params[factor] for factor in factors})
         point = Point(number=number, name=name, levels={**params}, changes=changes, value=value)
         try:
             checksum = self._search.study_of([point]).all_conditions[0].checksum

@@ -1,4 +1,4 @@
-"""Governor: sets a number of another institution every few turns, by what anybody could see.
+"""Governor: sets a number of another institution every few turns, by what anybody could observe.
 
 No agent votes on the number. An experiment says by what the governor decides, see `Experiment.governor`.
 """
@@ -19,16 +19,16 @@ from cprl.values import Custom, Positive, Share, Where
 from cprl.values.array_types import AnyArray, Float32
 
 Number = Literal["quota.share", "tax.rate", "sanctions.level"]
-SETS: Final[dict[str, type[Institution]]] = {
+CONTROLLED: Final[dict[str, type[Institution]]] = {
     "quota.share": Quota,
     "tax.rate": Tax,
     "sanctions.level": GraduatedSanctions,
 }
-"""The kind of institution that has each number."""
-Sight = Literal["stock", "harvest", "lowest_harvest", "equality", "violations", "time"]
+"""The kind of institution that has each number which a governor can control."""
+Feature = Literal["stock", "harvest", "lowest_harvest", "equality", "violations", "time"]
 Objective = Literal["income", "lowest_income", "income_times_equality"]
-Sights = Annotated[
-    tuple[Sight, ...],
+Features = Annotated[
+    tuple[Feature, ...],
     Where(lambda sees: sees and len(set(sees)) == len(sees), "one or more names, each once"),
 ]
 
@@ -40,12 +40,14 @@ class Governor(Institution):
 
     It decides before the first turn of a training or an evaluation, and then after every `every_steps` turns.
     Its number stays in force until it decides again, also where a new episode begins. Without a governor in
-    `Experiment.governor` the first option stays in force. Agents observe the number in force, a new one from
-    the turn after the first under it.
+    `Experiment.governor` the first option stays in force.
+
+    Agents observe the number that was in force in the last turn: in the first turn of a new number they
+    still observe the old one.
     """
 
     sets: Number
-    """The number that it sets, of the first institution of this kind in the game; its value there is not
+    """The controlled number, of the first institution of its kind in the game; its value there is not
     used."""
 
     options: Choices = (0.0, 0.25, 0.5, 0.75, 1.0)
@@ -55,12 +57,16 @@ class Governor(Institution):
     every_steps: Positive = 50
     """The length of a period: the turns from one decision to the next."""
 
-    sees: Sights = ("stock", "harvest", "lowest_harvest", "violations", "time")
-    """What it sees of a world: "stock", the share of all sites that hold an apple; of the episode so far
-    "harvest", the apples per turn of all agents, "lowest_harvest", the lowest harvest of an agent relative to
-    the mean, "equality", 1 - Gini of the harvests (`cprl.institutions.equality`), and "violations", the share
-    of turns in which an agent broke a rule; "time", the part of the longest episode that is over. Where
-    nobody has harvested yet, all have the same: "lowest_harvest" and "equality" are 1."""
+    sees: Features = ("stock", "harvest", "lowest_harvest", "violations", "time")
+    """The features of a world that it observes, all but the first of the episode so far:
+
+    - "stock": the share of all sites that hold an apple, 0..1;
+    - "harvest": the apples per turn of all agents together;
+    - "lowest_harvest": the lowest harvest of an agent relative to the mean, 0..1; 1 before any harvest;
+    - "equality": 1 - Gini of the harvests, see `cprl.institutions.equality`; 1 before any harvest;
+    - "violations": the share of turns in which an agent broke a rule, 0..1, a mean over agents;
+    - "time": the part of the longest episode that is over, 0..1.
+    """
 
     objective: Objective | Custom = "income"
     """What it wants of a period, see `cprl.measuring.welfare`; or a function of its own, which returns a
@@ -77,13 +83,13 @@ class Governor(Institution):
 
     def governed(self, game: Any) -> Institution | None:
         """Return the institution whose number it sets; None if the game has none."""
-        kind = SETS[self.sets]
+        kind = CONTROLLED[self.sets]
         return next((other for other in game.institutions if type(other) is kind), None)
 
     @property
-    def decided(self) -> Ballot:
-        """Return what it decides, in the form of a ballot that is never held."""
-        return Ballot(SETS[self.sets].voted_on, self.options, False, 0, 0.0)
+    def controlled(self) -> Ballot:
+        """Return the controlled number with its options, as a ballot that is never held."""
+        return Ballot(title=CONTROLLED[self.sets].voted_on, choices=self.options)
 
     def check(self, game: Any) -> None:
         governed = self.governed(game)
@@ -99,26 +105,32 @@ class Governor(Institution):
                 "turns of an episode"
             )
 
-    def see(
-        self, stock: AnyArray, steps: AnyArray, harvested: AnyArray, violations: AnyArray, clock: int
+    def observe(
+        self,
+        *,
+        stock: AnyArray,
+        elapsed_steps: AnyArray,
+        harvested: AnyArray,
+        violations: AnyArray,
+        horizon_steps: int,
     ) -> Float32:
-        """Return what it sees of B worlds, [B, F], in the order of `sees`.
+        """Return the features of B worlds, float32 [B, S], in the order of `sees`.
 
         Args:
             stock: the share of all sites that hold an apple, [B].
-            steps: the turns of the episode so far, [B].
+            elapsed_steps: the turns of the episode so far, [B].
             harvested: the apples of each agent in the episode so far, [B, N].
             violations: the turns in which each agent broke a rule, [B, N].
-            clock: the turns of the longest episode.
+            horizon_steps: the turns of the longest episode.
         """
-        played = np.maximum(steps, 1)
+        played = np.maximum(elapsed_steps, 1)
         mean = harvested.mean(1)
-        sights: dict[str, Callable[[], AnyArray]] = {
+        features: dict[str, Callable[[], AnyArray]] = {
             "stock": lambda: stock,
             "harvest": lambda: harvested.sum(1) / played,
             "lowest_harvest": lambda: np.where(mean > 0, harvested.min(1) / np.maximum(mean, 1e-9), 1.0),
             "equality": lambda: np.nan_to_num(equality(harvested), nan=1.0),
             "violations": lambda: violations.mean(1) / played,
-            "time": lambda: steps / clock,
+            "time": lambda: elapsed_steps / horizon_steps,
         }
-        return np.stack([sights[name]() for name in self.sees], 1).astype(np.float32)
+        return np.stack([features[name]() for name in self.sees], 1).astype(np.float32)

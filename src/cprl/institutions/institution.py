@@ -23,11 +23,12 @@ class Ballot(NamedTuple):
     """The thing to decide, in words."""
     choices: tuple[float, ...]
     """The values to choose from; in an election the indices of agents."""
-    is_election: bool
+    is_election: bool = False
     """Whether the choice with most votes wins; otherwise the median of the decisions does."""
-    period_episodes: int
-    """The ballot is held at the first of every such number of episodes; 0 for what a governor sets."""
-    override_prob: float
+    period_episodes: int = 0
+    """The ballot is held at the first of every such number of episodes; 0 for what a governor sets, on which
+    no agent votes."""
+    override_prob: float = 0.0
     """The probability that the result is drawn by chance, whatever agents decide."""
 
 
@@ -81,7 +82,7 @@ class Institution(Value, stored=False):
 
         Args:
             number: its index among the game's institutions of its kind, the argument by default.
-            ballot: the index of its ballot; for an institution without a ballot, of the next one.
+            ballot: the index in `Game.in_force` of what is decided about it, or -1.
             agents: the number of agents N.
         """
         return [(entry, number) for entry in self.entries]
@@ -128,9 +129,8 @@ def with_ballots(game: Any, kind: type[Kind]) -> list[tuple[Kind, int]]:
 
     An institution that is voted on counts as one of its kind.
     """
-    governed = None if game.governor is None else game.governor.governed(game)
     return [
-        (institution.rule, ballot if institution.ballot(game.agents) or institution is governed else -1)
+        (institution.rule, ballot)
         for institution, ballot in numbered(game)
         if isinstance(institution.rule, kind)
     ]
@@ -152,14 +152,19 @@ def columns(kind: type[Kind], arrays: Any, game: Any) -> dict[str, Any]:
 
 
 def numbered(game: Any) -> Iterator[tuple[Institution, int]]:
-    """Yield the institutions of a game, each with the number of ballots before it: the index of its own. A
-    governor, and what it governs, come after all ballots."""
+    """Yield the institutions of a game, each with the index in `Game.in_force` of what is decided about it,
+    or -1. What a governor sets comes after all ballots."""
     ballots = 0
     governor = game.governor
     last = () if governor is None else (governor, governor.governed(game))
     for institution in game.institutions:
-        yield institution, len(game.ballots) if any(institution is each for each in last) else ballots
-        ballots += institution.ballot(game.agents) is not None
+        if any(institution is each for each in last):
+            yield institution, len(game.ballots)
+        elif institution.ballot(game.agents):
+            yield institution, ballots
+            ballots += 1
+        else:
+            yield institution, -1
 
 
 def threshold(prob: float) -> int:

@@ -55,7 +55,12 @@ class Monitoring(Institution):
     def ballot(self, agents: int) -> Ballot | None:
         if self.monitor != ELECTED:
             return None
-        return Ballot("who monitors", tuple(map(float, range(agents))), True, self.period_episodes, 0.0)
+        return Ballot(
+            title="who monitors",
+            choices=tuple(map(float, range(agents))),
+            is_election=True,
+            period_episodes=self.period_episodes,
+        )
 
     def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
         return [("detected", 0), *([("elected", ballot)] if self.monitor == ELECTED else [])]

@@ -51,7 +51,13 @@ class Sanctioner(Institution):
         if self.agents is not None:
             return None
         everyone = tuple(map(float, range(agents)))
-        return Ballot("who may fire", everyone, True, self.period_episodes, self.override_prob)
+        return Ballot(
+            title="who may fire",
+            choices=everyone,
+            is_election=True,
+            period_episodes=self.period_episodes,
+            override_prob=self.override_prob,
+        )
 
     def check(self, game: Any) -> None:
         check_agent_indices("Sanctioner.agents", self.agents or (), game.agents)

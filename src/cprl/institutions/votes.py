@@ -64,7 +64,12 @@ class Vote(Institution):
         return self.on.can_be_broken
 
     def ballot(self, agents: int) -> Ballot:
-        return Ballot(self.on.voted_on, self.choices, False, self.period_episodes, self.override_prob)
+        return Ballot(
+            title=self.on.voted_on,
+            choices=self.choices,
+            period_episodes=self.period_episodes,
+            override_prob=self.override_prob,
+        )
 
     def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
         return [("in force", ballot)]

@@ -10,9 +10,9 @@ appropriation" (2017); [W] Wiatrak, "Governing the Commons with Multi-Agent Rein
 [O] Ostrom, "Governing the Commons" (1990), whose principles the metrics of institutions belong to.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from inspect import signature
 from math import inf
 from typing import Any, Final
@@ -24,9 +24,10 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons.cells import APPLE, Colour
-from cprl.institutions import COUNT_NAMES, Governor, Institution, Levies, ledger
+from cprl.commons.game import Game
+from cprl.commons.yields import unproven
+from cprl.institutions import COUNT_NAMES, Levies, ledger
 from cprl.measuring.social import (
-    AgentGroups,
     equality,
     equality_between,
     equality_within,
@@ -34,6 +35,7 @@ from cprl.measuring.social import (
     mean_of_defined,
     share_of,
 )
+from cprl.measuring.welfare import welfare
 from cprl.pictures.colours import BLUE, GREEN, GREY, ORANGE, PALETTE, PURPLE, VERMILION
 from cprl.values import METRIC_WORDS
 from cprl.values.array_types import AnyArray, Float64
@@ -269,6 +271,7 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
         unit=APPLES,
         formula=lambda harvest: harvest.sum(-1),
         colour=ORANGE,
+        is_summarised=True,
     ),
     # sum_i (R_i - fines_i + transfers_i), the sum of all returns; also in games without a harvest.
     Metric(
@@ -277,6 +280,7 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
         unit=APPLES,
         formula=lambda return_: return_.sum(-1),
         plot=None,
+        is_summarised=True,
         is_stored=False,
         same_as=COLLECTIVE_RETURN,
     ),
@@ -465,14 +469,14 @@ METRICS: Final[Mapping[str, Metric]] = _by_name(
         name="governor/rule",
         words="mean of what the governor sets",
         unit="rate, share or level",
-        formula=lambda rules, steps, wanted: share_of(rules[..., -1], steps),
+        formula=lambda rules, steps, objective: share_of(rules[..., -1], steps),
         colour=PURPLE,
     ),
     Metric(
         name="governor/objective",
         words="objective of the governor",
         unit="a turn",
-        formula=lambda harvest, fines, transfers, steps, stock_left, wanted: wanted(
+        formula=lambda harvest, fines, transfers, steps, stock_left, objective: objective(
             incomes_of(harvest, fines, transfers), steps, stock_left
         ),
         colour=GREEN,
@@ -489,8 +493,7 @@ def compute_metrics(totals: Mapping[str, Any], names: Iterable[str] = METRICS) -
     """Return the metrics whose totals and constants are all given, by name, each float64 [...].
 
     Args:
-        totals: arrays [..., N] or [...] by the names of `TOTALS`; also the constants "sustainable_yield",
-            "first_stock", "groups" and "wanted" (see `EpisodeTracker`) of a game that has them.
+        totals: arrays [..., N] or [...] by the names of `TOTALS`; also `constants_of` the game.
         names: the names of the metrics to compute.
     """
     known = {name: value for name, value in totals.items() if value is not None}
@@ -503,20 +506,35 @@ def compute_metrics(totals: Mapping[str, Any], names: Iterable[str] = METRICS) -
     return metrics
 
 
-def metrics_for(reported: Collection[str], institutions: Sequence[Institution] = ()) -> tuple[str, ...]:
-    """Return the metrics that make sense for a game, in order, without the yield share and the income, which
-    tables have.
+def constants_of(game: Game | None) -> dict[str, Any]:
+    """Return what metrics need of a game beside the totals of its episodes, by the names of their parameters.
+
+    "sustainable_yield", in apples per turn, and "first_stock" are given if the game's yield is proven;
+    "groups" with `Levies`, of which the first counts; "objective", a function of incomes, turns and the
+    apples left, with a governor. For None, a game that is not of cprl, nothing is given.
+    """
+    constants: dict[str, Any] = {}
+    if game is None:
+        return constants
+    if not unproven(game.rules):
+        constants["sustainable_yield"] = game.sustainable_yield
+        constants["first_stock"] = float(game.tables.first_stock)
+    levies = [institution for institution in game.institutions if isinstance(institution, Levies)]
+    if levies:
+        constants["groups"] = levies[0].groups
+    if game.governor is not None:
+        constants["objective"] = partial(welfare, game)
+    return constants
+
+
+def metrics_for(reported: Collection[str], game: Game | None = None) -> tuple[str, ...]:
+    """Return the metrics that make sense for a game, in order, without the income, which tables have.
 
     Args:
         reported: the entries that the game reports, of `OPTIONAL_ENTRIES` and `INSTITUTION_ENTRIES`.
-        institutions: its institutions; with none, its entries come from user code, and all metrics but those
-            of groups are returned.
+        game: the game; None for one that is not of cprl.
     """
-    known = {*counts_for(institutions), *TOTALS.keys() - {*COUNT_NAMES}, VIOLATIONS}
-    if nested_groups(institutions) is not None:
-        known.add("groups")
-    if any(isinstance(institution, Governor) for institution in institutions):
-        known.add("wanted")
+    known = {*counts_for(game), *TOTALS.keys() - {*COUNT_NAMES}, VIOLATIONS, *constants_of(game)}
     return tuple(
         name
         for name, metric in METRICS.items()
@@ -524,23 +542,18 @@ def metrics_for(reported: Collection[str], institutions: Sequence[Institution] =
     )
 
 
-def counts_for(institutions: Sequence[Institution]) -> tuple[str, ...]:
-    """Return the names of `cprl.institutions.COUNT_NAMES` that make sense for a game with these institutions;
-    all for a game without any, whose entries come from user code."""
-    counted = {VIOLATIONS, *(count for institution in institutions for count in institution.rule.counts)}
-    if not institutions:
+def counts_for(game: Game | None) -> tuple[str, ...]:
+    """Return the names of `cprl.institutions.COUNT_NAMES` that make sense for a game; all for a game without
+    institutions, in which only user code can count."""
+    if game is None or not game.institutions:
         return COUNT_NAMES
+    counted = {VIOLATIONS, *(count for institution in game.institutions for count in institution.rule.counts)}
     known = set[str]()
     for metric in METRICS.values():
         needed = set(metric.needs) & set(COUNT_NAMES)
         if needed <= counted:
             known |= needed
     return tuple(name for name in COUNT_NAMES if name in known)
-
-
-def nested_groups(institutions: Sequence[Institution]) -> AgentGroups | None:
-    """Return the groups of nested enterprises, those of the first `Levies`; None without one."""
-    return next((institution.groups for institution in institutions if isinstance(institution, Levies)), None)
 
 
 def reported_by(env: EnvBase) -> tuple[str, ...]:

@@ -50,12 +50,15 @@ class Observer:
     def _hooks(self, name: str) -> list[Callable[..., None]]:
         return [getattr(callback, name) for callback in self.callbacks if hasattr(callback, name)]
 
+    def _call(self, name: str, *arguments: Any) -> None:
+        for hook in self._hooks(name):
+            hook(*arguments)
+
     def on_start(self, training: Any) -> None:
         """Continue at the step of a training, and call `on_start`."""
         self.steps = training.steps
         self._speed = Speed(self.steps * self._series.replicas)
-        for on_start in self._hooks("on_start"):
-            on_start(training)
+        self._call("on_start", training)
 
     def on_step(self, batch: TensorDictBase) -> None:
         self.steps += self._series.worlds
@@ -63,27 +66,23 @@ class Observer:
             on_step(batch)
 
     def on_game(self, env: EnvBase, changes: str) -> None:
-        for on_game in self._hooks("on_game"):
-            on_game(env, changes)
+        self._call("on_game", env, changes)
 
     def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
-        for on_ended in self._hooks("on_ended"):
-            on_ended(ended)
+        self._call("on_ended", ended)
         for episode, learning in ended:
             self.on_episode(episode, learning)
 
     def on_episode(self, episode: Episode, learning: dict[str, float]) -> None:
         """Hand out an episode, and its numbers if all replicas have ended it."""
-        for on_episode in self._hooks("on_episode"):
-            on_episode(episode, learning)
+        self._call("on_episode", episode, learning)
         numbers = self._series.add(episode, numbers_of(episode, learning, self._agents))
         if numbers is None:
             return
         if self.steps:
             numbers[ENV_STEPS] = np.array([float(self.steps)])
             numbers[SPEED] = np.array([self._speed.lap(self.steps * self._series.replicas)])
-        for on_numbers in self._hooks("on_numbers"):
-            on_numbers(episode.episode, numbers)
+        self._call("on_numbers", episode.episode, numbers)
 
     def state_dict(self) -> dict[str, Any]:
         return {"steps": self.steps, **self._series.state_dict()}

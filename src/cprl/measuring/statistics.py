@@ -50,14 +50,9 @@ class Estimate:
     differs: bool = False
     """True for a difference that is not 0 by Holm's method in its family."""
 
-    def of(self, metric: str, clock: float = inf) -> Self:
+    def bounded(self, metric: str, clock: float = inf) -> Self:
         """Return this estimate with the bounds of a metric, which cut the shown interval."""
         return replace(self, bounds=bounds(metric, clock))
-
-    def between(self, metric: str, clock: float = inf) -> Self:
-        """Return this difference with the bounds of differences between values of a metric."""
-        least, most = bounds(metric, clock)
-        return replace(self, bounds=(least - most, most - least))
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -254,16 +249,15 @@ class Family(Mapping[Key, Estimate]):
     Args:
         estimates: by their keys, in the order of pages.
         by: the names of the labels.
-        name: the name of a family of differences, e.g. "these 12 differences"; "" for other estimates.
-        tests: how many differences were tested together; one that two numbers share counts once.
+        tests: how many differences were tested together, of which one that two numbers share counts once;
+            None for estimates that are not tested.
     """
 
     def __init__(
-        self, estimates: Mapping[Key, Estimate], by: Sequence[str] = (), name: str = "", tests: int = 0
+        self, estimates: Mapping[Key, Estimate], by: Sequence[str] = (), tests: int | None = None
     ) -> None:
         self._estimates = dict(estimates)
         self.by = tuple(by)
-        self.name = name
         self.tests = tests
 
     def __getitem__(self, key: Key | str) -> Estimate:
@@ -292,7 +286,7 @@ class Family(Mapping[Key, Estimate]):
     def changed(self, change: Callable[[Key, Estimate], Estimate]) -> "Family":
         """Return the same family with changed estimates, e.g. other bounds."""
         estimates = {key: change(key, estimate) for key, estimate in self.items()}
-        return Family(estimates, self.by, self.name, self.tests)
+        return Family(estimates, self.by, self.tests)
 
     def of(self, *labels: Any) -> dict[str, Estimate]:
         """Return the estimates with these labels by number."""
@@ -304,6 +298,7 @@ class Family(Mapping[Key, Estimate]):
 
     def note(self, of: str) -> str:
         """Return the meaning of bold; `of` says where these differences stand, e.g. "of this table"."""
+        assert self.tests is not None
         number = f"the {self.tests} differences" if self.tests != 1 else "the one difference"
         stands = sum(not isnan(estimate.p_value) for estimate in self.values())
         once = ", of which those that two columns have in common count once" if stands > self.tests else ""
@@ -351,7 +346,7 @@ def estimates(table: pa.Table, numbers: Sequence[str] | str = (), by: Sequence[s
     for row in labels:
         for name in names:
             if row in samples[name]:
-                means[*row, name] = samples[name][row].estimate.of(name, clock)
+                means[*row, name] = samples[name][row].estimate.bounded(name, clock)
     return Family(means, keys)
 
 
@@ -399,7 +394,8 @@ def differences(
             else:
                 continue
             if change.replicas:
-                changes[(*labels, name)] = change.between(name, clock)
+                least, most = bounds(name, clock)
+                changes[(*labels, name)] = replace(change, bounds=(least - most, most - least))
     return judge_family(changes, keys)
 
 
@@ -527,7 +523,7 @@ def judge_family(differences: Mapping[Key, Estimate], by: Sequence[str] = ()) ->
     differ = holm([differences[key].p_value for key in tests])
     marked = set(chain.from_iterable(compress(tests.values(), differ)))
     family = {key: replace(change, differs=key in marked) for key, change in differences.items()}
-    return Family(family, by, f"these {len(tests)} differences", len(tests))
+    return Family(family, by, len(tests))
 
 
 def _is_same(first: Estimate, second: Estimate) -> bool:

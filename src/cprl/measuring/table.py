@@ -222,19 +222,14 @@ def by_replica(table: pa.Table, metric: str, by: Sequence[str] = ()) -> pa.Table
 def _by_replica_of_windows(windows: pa.Table, keys: Sequence[str]) -> pa.Table:
     """Return the mean of the windows' values, each weighted by the episodes in which it is defined."""
     defined = pc.cast(pc.subtract(windows[WINDOWS], windows["undefined"]), pa.float64())
-    sums = pc.if_else(pc.equal(defined, 0), 0.0, pc.multiply(windows["value"], defined))
-    amounts = {
-        "sum": sums,
-        "defined": defined,
-        "episodes": windows[WINDOWS],
-        "undefined": windows["undefined"],
-    }
-    rows = pa.table({**{name: windows[name] for name in keys}, **amounts})
-    rows = rows.group_by(keys, use_threads=False).aggregate([(name, "sum") for name in amounts])
-    rows = rows.rename_columns([*keys, *amounts])
-    weight = pc.if_else(pc.equal(rows["defined"], 0), None, rows["defined"])
-    means = pc.divide(rows["sum"], weight)
-    return rows.select([*keys, "episodes", "undefined"]).add_column(len(keys), "value", means)
+    values = pc.if_else(pc.is_nan(windows["value"]), None, windows["value"])
+    rows = windows.append_column("sum", pc.multiply(values, defined))
+    rows = rows.group_by(keys, use_threads=False).aggregate(
+        [(name, "sum") for name in ("sum", WINDOWS, "undefined")]
+    )
+    rows = rows.rename_columns([*keys, "sum", "episodes", "undefined"])
+    means = pc.divide(rows["sum"], pc.subtract(rows["episodes"], rows["undefined"]))
+    return rows.drop_columns("sum").add_column(len(keys), "value", means)
 
 
 def _by_replica_of_episodes(rows: pa.Table, keys: Sequence[str]) -> pa.Table:

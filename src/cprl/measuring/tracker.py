@@ -16,9 +16,8 @@ from torchrl.envs import EnvBase
 
 from cprl import keys
 from cprl.commons.game import Game
-from cprl.commons.yields import unproven
-from cprl.envs.unwrap import agent_count, commons_of
-from cprl.institutions import COUNT_NAMES, Institution
+from cprl.envs.unwrap import agent_count, commons_game_of
+from cprl.institutions import COUNT_NAMES
 from cprl.keys import Turn
 from cprl.measuring.registry import (
     AGENT_TOTALS,
@@ -27,12 +26,10 @@ from cprl.measuring.registry import (
     METRICS,
     TOTALS,
     compute_metrics,
+    constants_of,
     counts_for,
-    metrics_for,
-    nested_groups,
     reported_in,
 )
-from cprl.measuring.welfare import welfare
 from cprl.values import Custom, Positive, checked, metric_words
 from cprl.values.array_types import AnyArray, Float64, Int64
 
@@ -162,7 +159,11 @@ def custom_metric_name(metric: Custom) -> str:
 
 
 def check_custom_metrics(metrics: Sequence[Custom]) -> None:
-    """Refuse custom metrics with the name of another number of an episode."""
+    """Refuse custom metrics with the name of another number of an episode.
+
+    Raises:
+        ValueError: for a name that is taken or that no column can have; the message names the metric.
+    """
     names = [custom_metric_name(metric) for metric in metrics]
     for name, metric in zip(names, metrics, strict=True):
         if not name.isidentifier():
@@ -274,13 +275,9 @@ class EpisodeTracker:
     later batch must have them. Fields and metrics that need other entries are left out of episodes.
 
     Args:
-        sustainable_yield: apples per step that the map can sustain; with first_stock, adds yield_share.
-        first_stock: apples on the board at the start of an episode.
-        institutions: those of the game, which determine their metrics, see
-            `cprl.measuring.registry.metrics_for`.
+        game: the game, whose yield, institutions and governor decide which metrics there are; None for one
+            that is not of cprl.
         metrics: custom metrics; each names a function of an `Episode` that returns a number.
-        wanted: the objective of the game's governor, a function of incomes, turns and the apples left, see
-            `cprl.measuring.welfare`.
 
     Raises:
         ValueError: if a number is below 1; in `add`, if a batch has a wrong shape or lacks an entry.
@@ -291,23 +288,15 @@ class EpisodeTracker:
         worlds: int,
         agents: int,
         *,
-        sustainable_yield: float | None = None,
-        first_stock: float | None = None,
-        institutions: Sequence[Institution] = (),
+        game: Game | None = None,
         metrics: Sequence[Custom] = (),
-        wanted: Any = None,
     ) -> None:
         self.worlds = checked("worlds", worlds, Positive)
         self.agents = checked("agents", agents, Positive)
         self.reported: tuple[str, ...] | None = None
         """The optional entries of this game; None before the first batch."""
-        self._constants: dict[str, Any] = {
-            "sustainable_yield": sustainable_yield,
-            "first_stock": first_stock,
-            "groups": nested_groups(institutions),
-            "wanted": wanted,
-        }
-        self._count_names = counts_for(institutions)
+        self._constants = constants_of(game)
+        self._count_names = counts_for(game)
         self._metrics = checked("metrics", metrics, tuple[Custom, ...])
         self._episode_numbers = np.zeros(worlds, np.int64)
         self._running_totals: dict[str, AnyArray] = {}
@@ -518,58 +507,17 @@ class EpisodeTracker:
 
 
 def tracker_of(env: EnvBase, metrics: Sequence[Custom] = ()) -> EpisodeTracker:
-    """Return an `EpisodeTracker` for all worlds of an environment, with its institutions, its sustainable
-    yield, and custom metrics."""
-    commons = commons_of(env)
-    wanted = None
-    if commons is not None and commons.game.governor is not None:
-        wanted = partial(welfare, commons.game)
+    """Return an `EpisodeTracker` for all worlds of an environment, with or without transforms."""
     return EpisodeTracker(
-        env.batch_size.numel(),
-        agent_count(env),
-        institutions=institutions_of(env),
-        metrics=metrics,
-        wanted=wanted,
-        **yield_of(env),
+        env.batch_size.numel(), agent_count(env), game=commons_game_of(env), metrics=metrics
     )
-
-
-def yield_of_game(game: Game) -> dict[str, float]:
-    """Return the sustainable yield of a game, in apples per turn, and its first stock; empty if no yield is
-    proven."""
-    if unproven(game.rules):
-        return {}
-    return {
-        "sustainable_yield": game.sustainable_yield,
-        "first_stock": float(game.tables.first_stock),
-    }
-
-
-def yield_of(env: EnvBase) -> dict[str, float]:
-    """Return the arguments of an `EpisodeTracker` for yield_share; none for a game without a board of
-    cprl."""
-    commons = commons_of(env)
-    return {} if commons is None else yield_of_game(commons.game)
-
-
-def institutions_of(env: EnvBase) -> tuple[Institution, ...]:
-    """Return the institutions of a game of cprl, with or without transforms; () for another game."""
-    commons = commons_of(env)
-    return () if commons is None else commons.game.institutions
-
-
-def metrics_of(env: EnvBase, reported: Collection[str]) -> tuple[str, ...]:
-    """Return the metrics of an environment that reports these entries, without custom metrics and
-    decisions."""
-    metrics = metrics_for(reported, institutions_of(env))
-    return metrics if commons_of(env) is None else (*metrics, "yield_share")
 
 
 def decisions_of(env: EnvBase) -> tuple[str, ...]:
     """Return the titles of the decisions in an episode, in the order of "in_force"."""
-    commons = commons_of(env)
-    if commons is not None and commons.game.in_force:
-        return tuple(ballot.title for ballot in commons.game.in_force)
+    game = commons_game_of(env)
+    if game is not None and game.in_force:
+        return tuple(ballot.title for ballot in game.in_force)
     (width,) = env.observation_spec[keys.IN_FORCE].shape[env.batch_dims :]
     return tuple(f"decision {number}" for number in range(width))
 

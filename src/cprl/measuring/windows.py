@@ -52,6 +52,12 @@ def episodes_after(world: Int64) -> Int64:
     return after
 
 
+def smoothed_episodes(episodes: int) -> int:
+    """Return the episodes of the running means of a training: 100, or 1/20 of all if that is less, so that
+    the curve of a short one keeps its shape."""
+    return min(SMOOTHED_EPISODES, max(1, episodes // 20))
+
+
 def mean_of_worlds(values: Float64, worlds: Int64, window: int) -> Float64:
     """Return the mean over the last episodes at each episode of a replica, in which every world counts alike.
 

@@ -89,10 +89,10 @@ class EpisodePicture:
 
     def draw(
         self,
-        moments: Sequence[WorldView],
+        boards: Sequence[WorldView],
         title: str,
         *,
-        comes_to: str = "",
+        headline: str = "",
         end: str = "",
         card: str = "",
         violators: Sequence[int] = (),
@@ -100,9 +100,9 @@ class EpisodePicture:
         """Return the picture after the latest turn.
 
         Args:
-            moments: the episode so far: the board at the start and after each turn.
+            boards: the episode so far: the board at the start and after each turn.
             title: the title; its size is reduced until it fits.
-            comes_to: the result of the whole episode, which stands below the title.
+            headline: the result of the whole episode, which stands below the title.
             end: how the episode ended, in orange beside the title; if "", the turn stands there.
             card: how the episode ended, in large letters across the board; "" for no card.
             violators: the indices of the agents that broke a rule, which get a white diamond.
@@ -112,30 +112,30 @@ class EpisodePicture:
         """
         image = Image.new("RGB", self.size, PALETTE[GROUND])
         draw = ImageDraw.Draw(image)
-        self._caption(draw, title, comes_to, end, f"turn {len(moments) - 1:,} of {self.steps:,}")
-        board = Image.fromarray(world_image(self.board, moments[-1], cell_pixels=self._cell_pixels))
-        if board.size != self._board_size:
-            board = board.resize(self._board_size, Image.Resampling.BOX)
-        image.paste(board, ((self.size[0] - self._board_size[0]) // 2, self._board_top))
+        self._caption(draw, title, headline, end, f"turn {len(boards) - 1:,} of {self.steps:,}")
+        board_image = Image.fromarray(world_image(self.board, boards[-1], cell_pixels=self._cell_pixels))
+        if board_image.size != self._board_size:
+            board_image = board_image.resize(self._board_size, Image.Resampling.BOX)
+        image.paste(board_image, ((self.size[0] - self._board_size[0]) // 2, self._board_top))
         for agent in violators:
-            self._mark_violator(draw, agent, moments[-1])
+            self._mark_violator(draw, agent, boards[-1])
         if card:
             colour = _DEAD if end else _TEXT
             self._card(draw, card, colour)
-        self._plot_stock(draw, np.array([moment.stock.sum(dtype=np.int64) for moment in moments]))
-        self._plot_harvests(draw, np.array([moment.harvested for moment in moments]))
+        self._plot_stock(draw, np.array([board.stock.sum(dtype=np.int64) for board in boards]))
+        self._plot_harvests(draw, np.array([board.harvested for board in boards]))
         return np.asarray(image)
 
-    def _mark_violator(self, draw: ImageDraw.ImageDraw, agent: int, moment: WorldView) -> None:
+    def _mark_violator(self, draw: ImageDraw.ImageDraw, agent: int, board: WorldView) -> None:
         """Draw a diamond around an agent that broke a rule, as `cprl.viewer.replay_views` does.
 
         An agent that is out of play, because a sanction took effect at once, also gets its number.
         """
-        left, top, right, bottom = self.cell_box(int(moment.row[agent]), int(moment.col[agent]))
+        left, top, right, bottom = self.cell_box(int(board.row[agent]), int(board.col[agent]))
         centre = (left + right) / 2, (top + bottom) / 2
         circle = *centre, (right - left) * _DIAMOND_RADIUS
         draw.regular_polygon(circle, 4, 45, outline=_TEXT, width=max(1, self._unit // 5))
-        if not moment.in_play[agent]:
+        if not board.in_play[agent]:
             draw.text(centre, str(agent), agent_colour(agent), self._font, anchor="mm")
 
     def cell_box(self, row: int, col: int) -> tuple[float, float, float, float]:
@@ -147,12 +147,12 @@ class EpisodePicture:
         top = self._board_top + row * cell_height
         return left + col * cell_width, top, left + (col + 1) * cell_width, top + cell_height
 
-    def _caption(self, draw: ImageDraw.ImageDraw, title: str, comes_to: str, end: str, turn: str) -> None:
+    def _caption(self, draw: ImageDraw.ImageDraw, title: str, headline: str, end: str, turn: str) -> None:
         """Write the title on the left, the turn or the end on the right, and the result below them."""
         edge = self._unit
         middle = 3 * self._unit // 2
-        below = _fitting(comes_to, self.size[0] - 2 * edge, 5 * self._unit // 4)
-        draw.text((edge, 15 * self._unit // 4), comes_to, _TEXT, below, anchor="lm")
+        below = _fitting(headline, self.size[0] - 2 * edge, 5 * self._unit // 4)
+        draw.text((edge, 15 * self._unit // 4), headline, _TEXT, below, anchor="lm")
         state, colour = (end, _DEAD) if end else (turn, _TEXT)
         font = _fitting(state, (self.size[0] - 3 * edge) / 2, 4 * self._unit // 3)
         draw.text((self.size[0] - edge, middle), state, colour, font, anchor="rm")

@@ -188,7 +188,7 @@ def meaning_of(institution: Institution, game: Game) -> str:
             return _vote(institution, game)
         case Governor(every_steps=every):
             options = ", ".join(map(_number, institution.options))
-            return f"Every {_turns(every)} a governor sets {institution.decided.title}: one of {options}."
+            return f"Every {_turns(every)} a governor sets {institution.controlled.title}: one of {options}."
         case Tax():
             return _tax(institution)
         case Levies(groups=groups, local_rate=local, joint_rate=joint):

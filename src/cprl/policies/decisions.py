@@ -316,7 +316,7 @@ def stored_decisions(
     replicas: Sequence[int],
     worlds: int,
     seed: int,
-    purpose: Purpose = Purpose.EVALUATED_DECISIONS,
+    purpose: Purpose,
 ) -> Decider | None:
     """Return a decider of agents that vote by the values of earlier runs and do not explore.
 

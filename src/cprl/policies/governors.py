@@ -109,11 +109,16 @@ class GovernorActor(nn.Module):
         self.seen: Tensor | None = None
         """What the governor saw when it decided last, float32 [B, S]; None before its first decision."""
 
+    @property
+    def is_due(self) -> bool:
+        """Return whether it decides in the coming turn."""
+        return self.turns >= self.from_turn and self.turns % self.governor.every_steps == 0
+
     def decide(self, seen: Tensor) -> Tensor:
         """Return the options in force in the coming turn, int64 [B]; `seen`: float32 [B, S]."""
         if self.rule is None:
             self.rule = torch.zeros(len(seen), dtype=torch.int64, device=seen.device)
-        if self.turns >= self.from_turn and self.turns % self.governor.every_steps == 0:
+        if self.is_due:
             self.seen = seen
             self.rule = self._choose(seen)
         self.turns += 1

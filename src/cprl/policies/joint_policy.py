@@ -121,7 +121,7 @@ class JointPolicy(TensorDictModuleBase):
         if self.governor is not None:
             keys.put(tensordict, keys.RULE, self.governor.decide(keys.entry(tensordict, keys.SEEN)))
         observation = keys.entry(agents, "observation")
-        self._refuse_other_agents(observation.shape[batch_dims])
+        self.refuse_other_agents(observation.shape[batch_dims])
         shape = observation.shape[: batch_dims + 1]
         if self.state_cells:
             recurrent_state.prepare(agents, (*shape, self.state_cells), observation.device)
@@ -144,7 +144,7 @@ class JointPolicy(TensorDictModuleBase):
                 f"{worlds}; allowed: as many, e.g. run.policy(replica, worlds={worlds})"
             )
 
-    def _refuse_other_agents(self, agents: int) -> None:
+    def refuse_other_agents(self, agents: int) -> None:
         """Raise a ValueError unless the environment has as many agents as the actors control."""
         if agents != self.agents:
             raise ValueError(

@@ -56,6 +56,9 @@ def with_changes(experiment: Experiment, changes: Mapping[str, Any]) -> Experime
 
     Args:
         changes: the new values by path. Lists become tuples, and a board may be given by its name.
+
+    Raises:
+        ValueError: if a path matches nothing, or a value is not allowed there; the message names the path.
     """
     table = experiment.to_config()
     for path in sorted(changes, key=lambda path: (path.count("."), ALL not in path)):
@@ -122,7 +125,11 @@ def _places_in(holder: Any, name: str, above: list[str]) -> list[tuple[Any, Any]
 
 
 def normalised(path: object) -> str:
-    """Return a path with "_" for "-"; refuse anything that is not a path."""
+    """Return a path with "_" for "-"; refuse anything that is not a path.
+
+    Raises:
+        ValueError: for anything else.
+    """
     if not isinstance(path, str) or not path or not all(path.split(".")):
         raise refusal("path", path, 'names with dots between them, e.g. "game.rules.freeze_steps"')
     return path.replace("-", "_")
@@ -215,7 +222,11 @@ class Level:
 
 
 def checked_factors(factors: Mapping[str, Any]) -> dict[str, Factor]:
-    """Return the factors of a study with normalised paths and with tuples of values; refuse any other."""
+    """Return the factors of a study with normalised paths and with tuples of values; refuse any other.
+
+    Raises:
+        ValueError: for a factor that is none of the three; the message names it.
+    """
     normal: dict[str, Factor] = {}
     for name, factor in factors.items():
         if isinstance(factor, Mapping) and factor:
@@ -251,7 +262,11 @@ def levels_of(name: str, factor: Factor) -> list[Level]:
 
 
 def all_combinations(factors: Mapping[str, Factor]) -> list[dict[str, Level]]:
-    """Return all combinations of the factors' levels; the last factor varies fastest."""
+    """Return all combinations of the factors' levels; the last factor varies fastest.
+
+    Raises:
+        ValueError: for a distribution among the factors, or more than `MOST_CONDITIONS` combinations.
+    """
     for name, factor in factors.items():
         if isinstance(factor, Distribution):
             raise refusal(f"factors[{name!r}]", factor, "in a grid levels, or with draws=N")
@@ -340,6 +355,9 @@ def factors_of(experiment: Experiment, flags: Iterable[str]) -> dict[str, Factor
 
     Each flag is "PATH=VALUES": values separated by commas, e.g. "game.rules.freeze-steps=5,25", or a
     distribution, e.g. "agents.*.algorithm.settings.gamma=uniform(0.5,0.9)".
+
+    Raises:
+        ValueError: for a flag of another form, or a value that its field does not take.
     """
     factors: dict[str, Factor] = {}
     for flag in flags:

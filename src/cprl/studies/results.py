@@ -4,25 +4,16 @@ The summary and the figures need the table alone. So `summarise_again` can write
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from math import isnan
 from pathlib import Path
 from typing import Final
 
-from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, title, unit
-from cprl.measuring.statistics import Estimate, number_format
 from cprl.runs.files import refuse_links, write_text
 from cprl.studies.study import STATUS, Study
 from cprl.studies.study_figures import DRAWN, figures_of
-from cprl.studies.tables.comparing import (
-    compared_metrics,
-    comparison_tables,
-    condition_differences,
-    episodes_text,
-    pairing_text,
-)
-from cprl.studies.tables.effects import effect_tables, effect_weights, effects_of
+from cprl.studies.tables.comparing import compared_metrics, comparison_tables
+from cprl.studies.tables.effects import effect_tables
 from cprl.studies.tables.sources import study_table
 from cprl.studies.tables.tidy_table import (
     EVALUATION_PART,
@@ -30,7 +21,7 @@ from cprl.studies.tables.tidy_table import (
     TRAINING_PART,
     StudyTable,
 )
-from cprl.system.defaults import LAST_EPISODES, STUDY_TABLE, WINDOW_EPISODES
+from cprl.system.defaults import LAST_EPISODES, STUDY_TABLE
 from cprl.terminal.text_tables import TextTable, escape_cell, markdown
 
 SUMMARY: Final = "summary.md"
@@ -42,7 +33,6 @@ def write_results(
     out: Path | str,
     runs: Path | str,
     *,
-    window: int = WINDOW_EPISODES,
     last: int = LAST_EPISODES,
     again: str = "",
 ) -> StudyTable:
@@ -51,7 +41,6 @@ def write_results(
     Args:
         out: the directory of the study.
         runs: the directory of its runs.
-        window: the number of episodes in a window of the table.
         last: the number of episodes at the end of the training that are compared.
         again: the command line that runs missing trials; the summary shows it.
 
@@ -60,7 +49,7 @@ def write_results(
     """
     out = Path(out)
     refuse_links(out)
-    table = replace(study_table(study, runs, window=window, status=out / STATUS), last=last)
+    table = replace(study_table(study, runs, status=out / STATUS), last=last)
     table.windows()  # refuses before anything is written
     table.write(out / STUDY_TABLE)
     draw_figures(table, out)
@@ -184,61 +173,3 @@ def _lengths(table: StudyTable) -> list[str]:
 
 def _range(least: int, most: int) -> str:
     return f"{least:,}" if least == most else f"{least:,} to {most:,}"
-
-
-def answer_of(table: StudyTable) -> str:
-    """Return the answer of a study in Markdown: the differences that the evaluation shows or does not show.
-
-    For a grid these are the effects of its factors, otherwise the differences from the reference. They are
-    about income and harvest if money moves, otherwise about the first metric. "" if there is nothing to
-    compare.
-    """
-    if not table.metrics or len(table.design.conditions) < 2:
-        return ""
-    metrics = compared_metrics(table, part=EVALUATION_PART)
-    subjects = {INCOME: _INCOME, COLLECTIVE_RETURN: _HARVEST}
-    if not subjects.keys() <= set(metrics):
-        subjects = {metrics[0]: title(metrics[0])}
-    beside = f"beside {escape_cell(table.design.reference)}, {pairing_text(table)}"
-    family = condition_differences(table, metrics, part=EVALUATION_PART)
-    tests = f"{family.tests} differences of their table below"
-    parts = []
-    for metric, subject in subjects.items():
-        if effect_weights(table):
-            family = effects_of(table, metric, part=EVALUATION_PART)
-            beside = "effects of each factor over all cells of the grid, paired by replica"
-            tests = f"{family.tests} effects on a metric"
-        changes = {name: one for (name,), one in family.column(metric).items()}
-        parts += [f"- {subject}:", *_lines(changes, unit(metric))]
-    what = f"In {episodes_text(table, EVALUATION_PART)}, {beside}"
-    what += f"; by Holm's method for the {tests}:" if family.tests else ":"
-    return "\n".join([what, "", *parts])
-
-
-_INCOME: Final = "**Income** of all agents together (harvest - fines + transfers), apples"
-_HARVEST: Final = "**Harvest** (collective return), apples"
-_NONE: Final = "no difference shown"
-_ALONE: Final = "not shown among so many, though it would be alone"
-_UNTOLD: Final = "cannot be told, as one replica has no interval"
-
-
-def _lines(differences: Mapping[str, Estimate], unit_of: str) -> list[str]:
-    """Return a line for each verdict: the differences above 0, below 0, and those that are not shown.
-
-    For differences that are not shown, the line says how large they would have to be to show.
-    """
-    by_kind: dict[str, list[str]] = {kind: [] for kind in ("more", "less", _NONE, _ALONE, _UNTOLD)}
-    for name, one in differences.items():
-        text = f"{escape_cell(name)} {one:+}"
-        if one.differs:
-            kind = "more" if one.value > 0 else "less"
-        elif isnan(one.reach):
-            kind = _UNTOLD
-        elif abs(one.value) > one.reach:
-            kind = _ALONE
-        else:
-            kind = _NONE
-            size = f"{one.reach:{number_format(one.value, one.low, one.high)}} {unit_of}".rstrip()
-            text += f" (differences below {size} would not show)" if one.reach else ""
-        by_kind[kind].append(text)
-    return [f"  - {kind}: {'; '.join(texts)}" for kind, texts in by_kind.items() if texts]

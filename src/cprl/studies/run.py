@@ -15,7 +15,7 @@ from cprl.runs.states import state_of
 from cprl.studies.executors import Executor, InProcess, Outcomes
 from cprl.studies.status import PATIENCE_S, Status, is_silent
 from cprl.studies.study import RUNS, STATUS, STUDY_FILE, Study, directory_of, levels_in
-from cprl.studies.tables.tidy_table import StudyTable
+from cprl.studies.tables.tidy_table import StudyTable, abbreviated
 from cprl.studies.trial_progress import Progress
 from cprl.studies.trials import (
     FinishedRuns,
@@ -119,6 +119,9 @@ def trials_with(trials: Sequence[Trial], only: Sequence[str] | None) -> list[Tri
 
     Args:
         only: names of conditions, or levels that their names contain, e.g. "gamma=0.9".
+
+    Raises:
+        ValueError: if no condition has such a name or levels.
     """
     if only is None:
         return list(trials)
@@ -163,7 +166,7 @@ def _run(
     """
     moved = move_aside([task.directory for task in tasks if is_of_other_code(task.directory)])
     if moved and progress:
-        places = f"{moved[0]}{f' and {len(moved) - 1} more' if moved[1:] else ''}"
+        places = abbreviated(list(map(str, moved)), 1)
         anew = f"{len(moved)} of {len(tasks)} trials are run anew, as the user's own code has changed"
         say(f"{anew}; what was there is kept: {places}")
     passed_over = _runs_of_another_engine(tasks)

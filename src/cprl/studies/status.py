@@ -23,7 +23,6 @@ from tensordict import TensorDictBase
 from cprl.experiment import Experiment
 from cprl.measuring.tracker import Episode
 from cprl.runs.files import RunLockedError, write_json
-from cprl.system.process import cpu
 from cprl.system.times import CLOCK, Speed
 from cprl.training import Training
 
@@ -104,13 +103,11 @@ class StatusFile:
         self._table: dict[str, Any] = {
             "pid": os.getpid(),
             "host": socket.gethostname(),
-            "cpu": cpu(),
             "episodes": 0,
             "of": experiment.length.episodes * experiment.replicas,
             "steps": 0,
             "beat": 0,
         }
-        self._began = time.monotonic()
         self._compiled_s = CLOCK.total_s
         self._experiment = experiment
         self._speed = Speed()
@@ -140,11 +137,9 @@ class StatusFile:
     def write(self) -> None:
         """Write the status now; the changed "beat" is a sign of life."""
         self._table["beat"] += 1
-        running_s = time.monotonic() - self._began
         compiling_s = CLOCK.total_s - self._compiled_s
         per_s = self._speed.mean(self._table["episodes"])
         times = {
-            "running_s": round(running_s, 1),
             "compiling_s": round(compiling_s, 1),
             "is_compiling": CLOCK.is_running,
             "episodes_per_s": None if per_s is None else round(per_s, 4),

@@ -214,7 +214,6 @@ class Study(Value, stored=False):
         elif not self.factors:
             yield UNCHANGED, {CONDITION: Level(UNCHANGED, {})}
         else:
-            short = short_names(self.factors)
             combinations: Iterable[dict[str, Level]]
             if self.draws is None:
                 combinations = all_combinations(self.factors)
@@ -222,7 +221,7 @@ class Study(Value, stored=False):
                 seed = self.experiment.seed
                 combinations = draw_combinations(self.factors, self.draws, seed=seed, design=self.design)
             for levels in combinations:
-                yield condition_name({short[factor]: level.value for factor, level in levels.items()}), levels
+                yield condition_name({factor: level.value for factor, level in levels.items()}), levels
 
     @cached_property
     def blocks(self) -> tuple[Block, ...]:
@@ -275,7 +274,11 @@ class Study(Value, stored=False):
 
     @classmethod
     def from_config(cls, table: Mapping[str, Any], *, directory: str | Path | None = None) -> "Study":
-        """Return the study of a table that `to_config` returned, stored in the directory."""
+        """Return the study of a table that `to_config` returned, stored in the directory.
+
+        Raises:
+            ValueError: for a table of another format, or with unknown or wrong fields.
+        """
         refuse_newer("the study", table, STUDY_FORMAT)
         if table.get("format") != STUDY_FORMAT:
             raise refusal("the study's format", table.get("format"), str(STUDY_FORMAT))
@@ -309,7 +312,11 @@ _PLAIN: Final = ("name", "question", "expectation", "draws", "design", "replicas
 
 def experiment_at(experiment: Experiment, levels: Mapping[str, Level]) -> Experiment:
     """Return the experiment with the changes of one level of each factor; refuse levels that contradict each
-    other."""
+    other.
+
+    Raises:
+        ValueError: if two levels change the same field, or one that the study itself decides.
+    """
     paths = [path for level in levels.values() for path in level.changes]
     if len(set(paths)) < len(paths):
         raise ValueError(f"two factors change the same field, of {', '.join(paths)}; allowed: one each")
@@ -325,8 +332,13 @@ LEVEL_SEPARATOR: Final = ", "
 
 
 def condition_name(levels: Mapping[str, Any]) -> str:
-    """Return the name of a condition, e.g. "freeze_steps=5, gamma=0.9"."""
-    return LEVEL_SEPARATOR.join(f"{name}={level_text(value)}" for name, value in levels.items())
+    """Return the name of a condition, e.g. "freeze_steps=5, gamma=0.9".
+
+    Args:
+        levels: the level of each factor, by the factor's path.
+    """
+    short = short_names(levels)
+    return LEVEL_SEPARATOR.join(f"{short[path]}={level_text(value)}" for path, value in levels.items())
 
 
 def with_unique_names(conditions: Iterable[Condition]) -> tuple[Condition, ...]:
@@ -404,7 +416,11 @@ STATUS: Final = "status"
 
 def directory_of(study: Study, out: Path | str | None) -> Path:
     """Return the directory of a study, by default `studies/<name>`; refuse a file and the directory of a
-    run."""
+    run.
+
+    Raises:
+        ValueError: for a file, or the directory of a run.
+    """
     directory = Path("studies") / study.name if out is None else Path(out)
     allowed = "a new directory, or the directory of an earlier study"
     if directory.exists() and not directory.is_dir():
@@ -415,7 +431,11 @@ def directory_of(study: Study, out: Path | str | None) -> Path:
 
 
 def read_study(out: Path | str) -> Study:
-    """Read the study that is stored in a directory."""
+    """Read the study that is stored in a directory.
+
+    Raises:
+        ValueError: if there is no such file, or it is not that of a study.
+    """
     path = Path(out) / STUDY_FILE
     try:
         table = read_json(path)

@@ -25,7 +25,7 @@ from matplotlib.ticker import NullLocator
 from cprl.measuring.registry import COLLECTIVE_RETURN, bounds, title
 from cprl.measuring.statistics import Estimate, Family, curve_interval
 from cprl.measuring.table import WINDOWS, by_replica, where
-from cprl.measuring.windows import SMOOTHED_EPISODES, running_mean
+from cprl.measuring.windows import running_mean, smoothed_episodes
 from cprl.pictures.readable import capitalised
 from cprl.studies.tables.comparing import (
     INTERVALS,
@@ -46,6 +46,7 @@ from cprl.terminal.style import (
     DASHES,
     MEAN,
     RANDOM_LINE,
+    Sheet,
     Width,
     drawing,
     wrapped,
@@ -85,7 +86,7 @@ def figures_of(
     if not table.metrics:
         return
     design = table.design
-    conditions = finished_conditions(table)
+    conditions = table.finished_conditions
     for factor in design.factors:
         if is_numeric([design.conditions[name][factor] for name in conditions]):
             draw = partial(by_factor, table, factor, metrics=metrics)
@@ -141,6 +142,9 @@ def by_factor(
         path: the file to draw.
         metrics: the metrics to draw; by default those that are compared.
         width: a "page" or a "column" of a paper.
+
+    Raises:
+        ValueError: for a factor without numeric levels, or a metric that the table does not have.
     """
     design = table.design
     numeric = [name for name in design.factors if is_numeric(design.levels(name))]
@@ -160,9 +164,7 @@ def by_factor(
                 axes.set_ylim(0, None)
             _scale(axes, layout.places, _replicas_by_level(table, factor), is_even=layout.is_even)
             axes.set_title(metric_title(metric, means))
-        for axes in panels[-columns:]:
-            axes.tick_params(labelbottom=True)
-            axes.set_xlabel(factor_word(factor) + ", at equal distances" * layout.is_even)
+        sheet.xlabel = factor_word(factor) + ", at equal distances" * layout.is_even
         sheet.title = f"{design.name}: outcome by {factor_word(factor)}"
         sheet.caption = figure_caption(table, f"{_levels_note(table)} Faint: single replicas.")
         if layout.others and list(layout.lines) == [""]:
@@ -196,8 +198,8 @@ def _factor_layout(table: StudyTable, factor: str) -> _FactorLayout:
     shades: Sequence[Any] = range(len(lines))
     if len(others) == 1:
         shades = [design.conditions[names[0]][others[0]] for names in lines.values()]
-    levels = {name: design.conditions[name][factor] for name in finished_conditions(table)}
-    places, is_even = places_of(levels.values())
+    levels = {name: design.conditions[name][factor] for name in table.finished_conditions}
+    places, is_even = axis_places(levels.values())
     return _FactorLayout(
         lines=lines,
         colours=line_colours(list(lines), shades),
@@ -251,7 +253,7 @@ def _is_same_at_each_place(random_play: Mapping[str, float], at: Mapping[str, fl
     return all(map(are_one_number, by_place.values()))
 
 
-def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
+def axis_places(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
     """Return the place of each level on the axis, ordered, and whether the places are at equal distances."""
     ordered = sorted(set(levels))
     at = np.log(ordered) if is_logarithmic(ordered) else np.array(ordered, np.float64)
@@ -263,7 +265,7 @@ def places_of(levels: Iterable[float]) -> tuple[dict[float, float], bool]:
 
 def _replicas_by_level(table: StudyTable, factor: str) -> Counter[float]:
     counts: Counter[float] = Counter()
-    for name in finished_conditions(table):
+    for name in table.finished_conditions:
         counts[table.design.conditions[name][factor]] += table.replicas[name]
     return counts
 
@@ -291,7 +293,7 @@ def _lines(table: StudyTable, factor: str, others: Sequence[str]) -> dict[str, l
     The conditions of a line are ordered by their level.
     """
     design = table.design
-    names = finished_conditions(table)
+    names = table.finished_conditions
     lines: dict[str, list[str]] = {}
     for name in names:  # lines are in the order of the conditions
         levels = design.conditions[name]
@@ -337,10 +339,14 @@ def by_condition(
         kind: "levels", with random play as dashes; or "differences", with a dashed line at 0.
         metrics: by default those that are compared, and of levels what institutions took and found.
         width: a "page" or a "column" of a paper.
+
+    Raises:
+        ValueError: for more than 60 conditions or none, a reference without a finished run, or a metric that
+            the table does not have.
     """
     design = table.design
     is_levels = kind == "levels"
-    conditions = [name for name in finished_conditions(table) if is_levels or name != design.reference]
+    conditions = [name for name in table.finished_conditions if is_levels or name != design.reference]
     if not is_levels and not table.replicas[design.reference]:
         raise ValueError(f"the reference {design.reference} has no finished run; allowed: one that has")
     if not 0 < len(conditions) <= _MOST_CONDITIONS:
@@ -350,31 +356,19 @@ def by_condition(
     levels = family if is_levels else condition_means(table, chosen)
     rows = table.windows()
     with drawing(path, width=width) as sheet:
-        wide = min(_NAME_WIDTH, 0.3 * sheet.width_em)
-        texts = condition_labels(table)
-        names = {name: wrapped(texts[name], wide) for name in conditions}
-        lines = [name.splitlines() for name in names.values()]
-        high = (_LINE_HEIGHT * max(map(len, lines)) + 0.8) * len(conditions) + 7
-        beside = CHARACTER * max(len(line) for name in lines for line in name)
-        columns = sheet.fitting(len(chosen), 12.5)
-        panels = sheet.panels(len(chosen), columns=columns, high=high, beside=beside, sharey=True)
+        labels = condition_labels(table)
+        panels = _row_panels(sheet, [labels[name] for name in conditions], len(chosen))
         for axes, metric in zip(panels, chosen, strict=True):
             values = values_of(rows, metric) if is_levels else {}
-            random_play = _random_play(table, metric) if is_levels else {}
             for place, name in enumerate(conditions):
                 _draw_row(axes, place, family.get((name, metric)), values.get(name, {}))
-                if name in random_play:
-                    look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
-                    axes.plot([random_play[name]] * 2, [place - 0.42, place + 0.42], **look)
-            if not is_levels:
+            if is_levels:
+                _draw_random_play(axes, conditions, _random_play(table, metric))
+            else:
                 axes.axvline(0, **RANDOM_LINE)
                 if axes.dataLim.width < _NO_WIDTH:
                     axes.set_xlim(-1, 1)
             axes.set_title(metric_title(metric, levels))
-            axes.set_yticks(range(len(conditions)), list(names.values()))
-            axes.locator_params(axis="x", nbins=3)
-            axes.grid(axis="y", color="#e6e6e6", linewidth=0.6)
-        panels[0].set_ylim(len(conditions) - 0.4, -0.6)
         by = factor_word(design.factors[0]) if len(design.factors) == 1 else "condition"
         sheet.title = f"{design.name}: outcome by {by}"
         note = f"{_levels_note(table)} Faint: single replicas. Dashed: random play."
@@ -386,12 +380,36 @@ def by_condition(
     return Path(path)
 
 
-def _draw_row(axes: Axes, place: int, one: Estimate | None, values: Mapping[int, float]) -> None:
+def _row_panels(sheet: Sheet, labels: Sequence[str], number: int) -> list[Axes]:
+    """Add panels with a row for each label, the first on top, as high as the labels need."""
+    names = [wrapped(label, min(_NAME_WIDTH, 0.3 * sheet.width_em)) for label in labels]
+    lines = [name.splitlines() for name in names]
+    high = (_LINE_HEIGHT * max(map(len, lines)) + 0.8) * len(names) + 7
+    beside = CHARACTER * max(len(line) for name in lines for line in name)
+    columns = sheet.fitting(number, 12.5)
+    panels = sheet.panels(number, columns=columns, high=high, beside=beside, sharey=True)
+    for axes in panels:
+        axes.set_yticks(range(len(names)), names)
+        axes.locator_params(axis="x", nbins=3)
+        axes.grid(axis="y", color="#e6e6e6", linewidth=0.6)
+    panels[0].set_ylim(len(names) - 0.4, -0.6)
+    return panels
+
+
+def _draw_random_play(axes: Axes, conditions: Sequence[str], random_play: Mapping[str, float]) -> None:
+    """Draw a dash for random play in the rows of the conditions that have it."""
+    look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
+    for place, name in enumerate(conditions):
+        if name in random_play:
+            axes.plot([random_play[name]] * 2, [place - 0.42, place + 0.42], **look)
+
+
+def _draw_row(axes: Axes, place: int, estimate: Estimate | None, values: Mapping[int, float]) -> None:
     """Draw the value of a condition in a row, or a text that says why there is none."""
-    if one is not None and one.replicas:
-        draw_dots(axes, [place], [one], replicas=[list(values.values())], across=True)
+    if estimate is not None and estimate.replicas:
+        draw_dots(axes, [place], [estimate], replicas=[list(values.values())], across=True)
         return
-    why = "no pairs" if one is None else "undefined"
+    why = "no pairs" if estimate is None else "undefined"
     box = {"facecolor": "white", "edgecolor": "none", "pad": 1}
     across = axes.get_yaxis_transform()
     axes.text(0.5, place, why, bbox=box, ha="center", va="center", transform=across)
@@ -401,8 +419,6 @@ def _draw_row(axes: Axes, place: int, one: Estimate | None, values: Mapping[int,
 
 _DEFAULT_COURSES: Final = (COLLECTIVE_RETURN, "survival_steps")
 """The metrics whose courses are drawn by default."""
-_SMOOTHED_SHARE: Final = 20
-"""A running mean covers at most 1/20 of a training, so that short trainings keep their course."""
 _MOST_TOGETHER: Final = 6
 """The largest number of conditions in one panel. With more, each has a panel, beside the reference."""
 
@@ -417,9 +433,12 @@ def courses(
 
     Args:
         metrics: by default the collective return and survival; else the first that the table has.
+
+    Raises:
+        ValueError: for more than 60 conditions, or a metric that the table does not have.
     """
     design = table.design
-    conditions = finished_conditions(table)
+    conditions = table.finished_conditions
     usual = [metric for metric in _DEFAULT_COURSES if metric in table.metrics]
     chosen = compared_metrics(table, metrics or usual)[: len(metrics) or 2]
     if len(conditions) > _MOST_CONDITIONS:
@@ -437,9 +456,7 @@ def courses(
             windows |= _draw_courses(axes, table, content.metric, content.lines, is_dashed=is_dashed)
             _draw_random_lines(axes, _random_play(table, content.metric), content.lines)
             axes.set_title(content.title)
-        for axes in panels[-columns:]:
-            axes.tick_params(labelbottom=True)
-            axes.set_xlabel("episode")
+        sheet.xlabel = "episode"
         for group in [[axes] for axes in panels] if is_together else [panels]:
             if all(axes.dataLim.y0 >= 0 for axes in group):
                 group[0].set_ylim(0, None)
@@ -528,7 +545,7 @@ def _draw_courses(
         length = int(lengths.max())
         episodes = pc.min(by_replica(rows, metric)["episodes"]).as_py()
         is_whole = (lengths == length).all(0)  # those that all replicas have
-        count = max(1, min(SMOOTHED_EPISODES, episodes // _SMOOTHED_SHARE) // length)
+        count = max(1, smoothed_episodes(episodes) // length)
         at = running_mean(_windows_of(rows, "episode")[0, is_whole] + (length - 1) / 2, count)
         curve = curve_interval(running_mean(_windows_of(rows, "value")[:, is_whole], count))
         label = " ".join(label.splitlines())
@@ -551,14 +568,9 @@ def _windows_of(rows: pa.Table, number: str) -> Float64:
 # What all of them share
 
 
-def finished_conditions(table: StudyTable) -> list[str]:
-    """Return the conditions that have a finished run. Figures leave out the others."""
-    return [name for name in table.design.conditions if table.replicas[name]]
-
-
 def missing_note(table: StudyTable) -> str:
     """Return a sentence that counts the conditions without a finished run; "" if there are none."""
-    count = len(table.design.conditions) - len(finished_conditions(table))
+    count = len(table.design.conditions) - len(table.finished_conditions)
     return f" Not run: {count} of {len(table.design.conditions)} conditions." if count else ""
 
 
@@ -636,7 +648,7 @@ def _levels_note(table: StudyTable) -> str:
 def metric_title(metric: str, levels: Family) -> str:
     """Return the title of a metric, with the number of episodes in which it is undefined, if any."""
     means = levels.column(metric).values()
-    undefined = sum(one.undefined for one in means)
-    episodes = sum(one.episodes for one in means)
+    undefined = sum(mean.undefined for mean in means)
+    episodes = sum(mean.episodes for mean in means)
     name = title(metric)
     return f"{name}, undefined in {undefined:,} of {episodes:,} episodes" if undefined else name

@@ -133,37 +133,34 @@ class Overview:
         if state == "finished" and reason is None:
             self._finished.add(trial.name)
             return TrialProgress(trial, "finished", of, of)
-        said = self._listen(trial.name)
+        status = self._read_status(trial.name)
         is_known = state != "missing" or trial.name in self._since
-        episodes = min(of, said.get("episodes", 0)) if is_known else 0
+        episodes = min(of, status.get("episodes", 0)) if is_known else 0
         if reason is not None or time.monotonic() - self._since.get(trial.name, -SILENT_S) >= SILENT_S:
             note = reason or self._status[trial.name].failure()
             note = note or (REASONS["refused"] if state == "refused" else "")
             idle: TrialState = "waiting" if state == "missing" else "unfinished"
-            if note:
-                idle = "failed"
-            return TrialProgress(trial, idle, episodes, of, note=note)
-        per_s = said.get("episodes_per_s") or 0.0
-        if said.get("is_compiling"):
-            note = f"for {format_duration(said.get('compiling_s', 0.0))}"
-            return TrialProgress(trial, "compiling", episodes, of, per_s, note)
-        if episodes == of:
-            return TrialProgress(trial, "evaluating", episodes, of, per_s)
-        note = f"{format_duration((of - episodes) / per_s)} left" if per_s else ""
-        return TrialProgress(trial, "running", episodes, of, per_s, note)
+            return TrialProgress(trial, "failed" if note else idle, episodes, of, note=note)
+        per_s = status.get("episodes_per_s") or 0.0
+        left = f"{format_duration((of - episodes) / per_s)} left" if per_s else ""
+        running = TrialProgress(trial, "running", episodes, of, per_s, left)
+        if status.get("is_compiling"):
+            note = f"for {format_duration(status.get('compiling_s', 0.0))}"
+            return running._replace(state="compiling", note=note)
+        return running._replace(state="evaluating", note="") if episodes == of else running
 
-    def _listen(self, name: str) -> Mapping[str, Any]:
+    def _read_status(self, name: str) -> Mapping[str, Any]:
         """Read the status of a trial, and note the time if it has changed.
 
         The first status that is read may be from a process that is dead: it counts as a change only if the
         process has just begun.
         """
-        said = self._status[name].read()
-        if said != self._last.get(name, {}):
-            if name in self._last or said.get("beat", 0) <= 1:
+        status = self._status[name].read()
+        if status != self._last.get(name, {}):
+            if name in self._last or status.get("beat", 0) <= 1:
                 self._since[name] = time.monotonic()
-            self._last[name] = said
-        return said
+            self._last[name] = status
+        return status
 
 
 class Progress:

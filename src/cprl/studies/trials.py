@@ -126,6 +126,9 @@ class Trial:
         """Refuse a directory that holds another run, e.g. one that was renamed or restored from a backup.
 
         A run that is not finished may be shorter than the trial: it is a copy that will be continued.
+
+        Raises:
+            ValueError: for another run; the message says how it differs.
         """
         run = self.directory
         stored = recipe_config(read_recipe(run))
@@ -208,15 +211,22 @@ class FinishedRuns:
         self._read: set[str] = set()
         self._by_content: dict[str, list[Path]] = {}
 
-    def like(self, config: Mapping[str, Any]) -> list[Path]:
-        """Return the finished runs of an experiment of any length, ordered by name."""
+    def longest_shorter(self, config: Mapping[str, Any]) -> Path | None:
+        """Return the longest run that is a shorter version of an experiment and can be extended."""
         for path in self._runs.glob("*"):
             if path.name not in self._read and state_of(path) == "finished":
                 self._read.add(path.name)
                 with suppress(ValueError, KeyError, TypeError):  # of a recipe that cannot be read
                     content = _content_of(recipe_config(read_recipe(path)))
                     self._by_content.setdefault(content, []).append(path)
-        return sorted(self._by_content.get(_content_of(config), []))
+        beginnings = []
+        for run in self._by_content.get(_content_of(config), []):
+            stored = read_recipe(run)
+            length = Length.of(recipe_config(stored))
+            is_kept = endings_of(run) and not changed_code(stored)
+            if is_kept and length.is_shorter_than(Length.of(config)):
+                beginnings.append((length.number, run))
+        return max(beginnings)[1] if beginnings else None
 
 
 def _content_of(config: Mapping[str, Any]) -> str:
@@ -290,10 +300,10 @@ class Task:
         if self.trial.condition.experiment.engine != "auto" or self.directory.exists():
             return None
         config = self.recipe["experiment"]
-        if _longest_shorter(config, self.finished):
+        if self.finished.longest_shorter(config):
             return None
         other = "compiled" if config["engine"] == "eager" else "eager"
-        return _longest_shorter({**config, "engine": other}, self.finished)
+        return self.finished.longest_shorter({**config, "engine": other})
 
     def settled(self) -> TrialOutcome | None:
         """Return the outcome of a trial that need not or cannot be run, and None for any other.
@@ -416,35 +426,20 @@ class Task:
             )
 
 
-def _longest_shorter(config: Mapping[str, Any], finished: FinishedRuns) -> Path | None:
-    """Return the longest finished run that is a shorter version of an experiment and can be extended."""
-    beginnings = []
-    for other in finished.like(config):
-        stored = read_recipe(other)
-        length = Length.of(recipe_config(stored))
-        is_kept = endings_of(other) and not changed_code(stored)
-        if is_kept and length.is_shorter_than(Length.of(config)):
-            beginnings.append((length.number, other))
-    return max(beginnings)[1] if beginnings else None
-
-
 def begin_from_shorter(
     run: Path, experiment: Experiment, recipe: Mapping[str, Any], finished: FinishedRuns
-) -> Path | None:
+) -> None:
     """Begin a run as a copy of the longest shorter run of the same experiment, which resuming then extends.
 
     The shorter run must have kept the state of its training. It stays as it is. A copy that was interrupted
-    is made anew.
-
-    Returns:
-        The run that was copied; None if there is none, or if a callback may depend on the number of episodes.
+    is made anew. Nothing is copied if a callback may depend on the number of episodes.
     """
     callbacks = [callback.resolve() for callback in experiment.callbacks]
     if any(not isinstance(callback, type) or depends_on_episodes(callback) for callback in callbacks):
-        return None
-    shorter = _longest_shorter(recipe["experiment"], finished)
+        return
+    shorter = finished.longest_shorter(recipe["experiment"])
     if shorter is None:
-        return None
+        return
     copying = run.with_name(f".{run.name}.copying-{os.getpid()}")
     shutil.rmtree(copying, ignore_errors=True)
     try:
@@ -453,7 +448,5 @@ def begin_from_shorter(
     except OSError:
         if not run.exists():  # else somebody else has begun it meanwhile
             raise
-        return None
     finally:
         shutil.rmtree(copying, ignore_errors=True)
-    return shorter

@@ -10,15 +10,13 @@ from matplotlib.axes import Axes
 
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, unit, with_unit
 from cprl.measuring.table import complete, episodes
-from cprl.measuring.windows import SMOOTHED_EPISODES, episodes_per_world, mean_of_worlds
+from cprl.measuring.windows import episodes_per_world, mean_of_worlds, smoothed_episodes
 from cprl.runs.curves import as_curves, curve_worlds, episode_of_turn
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.terminal import style
 from cprl.terminal.style import MARK, Width
 from cprl.values.array_types import Float64
 
-_LEAST_WINDOWS: Final = 20
-"""A running mean is over at most 1/20 of a training, so that the curve of a short one keeps its shape."""
 _HEIGHTS_EM: Final = (24, 13, 12, 12)
 """The heights of the panels from the top, in em."""
 _INSTITUTION_PANELS: Final = ("institutions/violations", "institutions/fines")
@@ -59,7 +57,7 @@ def training_curve(
     worlds = curve_worlds(table)
     lanes = len(np.unique(worlds[0]))
     length = worlds.shape[1]
-    window = min(SMOOTHED_EPISODES, max(1, length // _LEAST_WINDOWS))
+    window = smoothed_episodes(length)
     averaged_episodes = episodes_per_world(window, lanes) * lanes
     random_means: dict[str, float] = {}
     if random is not None:
@@ -87,7 +85,7 @@ def training_curve(
             axes.set(xlim=(-0.5, max(length - 0.5, 1)), ylabel=with_unit(metric))
             if values.min() >= 0:
                 axes.set_ylim(0, None)
-        panels[-1].set_xlabel("episode")
+        sheet.xlabel = "episode"
         sheet.title = title.encode("utf-8", "replace").decode()
         sheet.caption = _caption(averaged_episodes, lanes)
         if exploration_turns is not None:

@@ -6,11 +6,12 @@ from typing import Any, Final
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Normalize, to_rgba
+from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike
 
 from cprl.measuring.statistics import Estimate
-from cprl.terminal.style import CHARACTER, EMPTY, MEAN, Sheet, draw_cell, wrapped
+from cprl.terminal.style import CHARACTER, EMPTY, MEAN, Sheet, wrapped
 from cprl.values.array_types import Float64
 
 _BAND_OPACITY: Final = 0.2
@@ -138,12 +139,20 @@ def draw_cells(
     share: float = 1.0,
     upward: bool = False,
 ) -> None:
-    """Draw a matrix of cells, each with its colour and its text; for the arguments see `draw_matrix`."""
+    """Draw a matrix of cells, each with its colour and its text; for the arguments see `draw_matrix`.
+
+    Texts are black on light colours and white on dark ones.
+    """
     names = list(columns.values())
     row_index = {key: index for index, key in enumerate(rows)}
     column_index = {key: index for index, key in enumerate(columns)}
     for (row, column), (colour, text) in cells.items():
-        draw_cell(axes, column_index[column], row_index[row], colour, text)
+        x = column_index[column]
+        y = row_index[row]
+        red, green, blue, _ = to_rgba(colour)
+        ink = "black" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.5 else "white"
+        axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
+        axes.text(x, y, text, ha="center", va="center", color=ink)
     cell_width_em = width_of_cells(sheet, rows, columns, share=share)
     rotation = 90
     if cell_width_em >= min(_longest(names), 6):

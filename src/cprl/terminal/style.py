@@ -17,10 +17,8 @@ from typing import Any, Final, Literal
 import matplotlib
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Rectangle
 
 from cprl.runs.files import refuse_to_write_over, write_atomically, write_text
 from cprl.terminal.text_tables import wrap_lines
@@ -109,11 +107,15 @@ class Sheet:
         self.caption = ""
         """The small text below the figure, which says how it was made."""
         self.legend_title = ""
+        self.xlabel = ""
+        """The label below the lowest panel of each column."""
         self._middle: Any = self.figure.subfigures()
         """The panels and their legend, between title and caption."""
         self._panel_wide_em = 0.0
         self._row_heights_em: dict[Axes, float] = {}
         """The height of each panel's row."""
+        self._lowest: list[Axes] = []
+        """The lowest panel of each column."""
         self._panels_high_em = 0.0
         """The height of all rows of panels together."""
 
@@ -148,7 +150,9 @@ class Sheet:
         for index, axes in enumerate(panels):
             self._row_heights_em[axes] = heights[index // columns]
             axes.set_visible(index < number)
-        return panels[:number]
+        panels = panels[:number]
+        self._lowest = panels[-columns:]
+        return panels
 
     def finish(self) -> None:
         """Add title, legend and caption, and make the figure as high as all its parts need."""
@@ -173,7 +177,10 @@ class Sheet:
         self._scale_lines()
 
     def _wrap_labels(self) -> None:
-        """Wrap the titles and the axis labels of all panels."""
+        """Wrap the titles and the axis labels of all panels, with the label that they share."""
+        for axes in self._lowest if self.xlabel else ():
+            axes.tick_params(labelbottom=True)
+            axes.set_xlabel(self.xlabel)
         for axes in self.figure.axes:
             row_height_em = self._row_heights_em.get(axes, self._panels_high_em)
             axes.set_title(wrapped(axes.get_title("left"), self._panel_wide_em - 1))
@@ -245,6 +252,10 @@ def check_picture(path: str | Path, name: str = "path", *, is_new: bool = True) 
     Args:
         name: the name of the argument, for a refusal.
         is_new: whether to refuse a path that exists.
+
+    Raises:
+        ValueError: for another suffix than `PICTURE_SUFFIXES`.
+        FileExistsError: if the path exists and `is_new`.
     """
     path = Path(path)
     if path.suffix not in PICTURE_SUFFIXES:
@@ -295,11 +306,3 @@ def _with_colours(drawn: BytesIO, colours: int) -> BytesIO:
 def wrapped(text: str, wide: float, character: float = CHARACTER) -> str:
     """Break a text into lines of at most `wide` em, with characters of about `character` em."""
     return wrap_lines(text, max(4, int(wide / character)))
-
-
-def draw_cell(axes: Axes, x: int, y: int, colour: Any, text: str) -> None:
-    """Draw a cell of one unit around (x, y); its text is black on light colours and white on dark ones."""
-    red, green, blue, _ = to_rgba(colour)
-    ink = "black" if 0.299 * red + 0.587 * green + 0.114 * blue > 0.5 else "white"
-    axes.add_patch(Rectangle((x - 0.5, y - 0.5), 1, 1, facecolor=colour, edgecolor="white"))
-    axes.text(x, y, text, ha="center", va="center", color=ink)

@@ -86,8 +86,7 @@ def _is_summarised(name: str) -> bool:
     metric = METRICS.get(name)
     if metric is None:
         return not name.endswith("/return")
-    is_total_gain = name in (COLLECTIVE_RETURN, INCOME)
-    return is_total_gain or metric.is_summarised or metric.is_of_institutions
+    return metric.is_summarised or metric.is_of_institutions
 
 
 def rewards_of(table: pa.Table) -> str:
@@ -143,12 +142,13 @@ def comparison_table(
             rows.append(row)
     for title, counts in _counts(table, policies).items():
         rows.append([title, *counts, *[""] * len(compared)])
+    is_any_marked = any(change.differs for change in changes.values())
     notes = [
         (table.schema.metadata or {}).get(LEFT_OUT, b"").decode(),
         ZEROS if empty else "",
         *(IDLE.format(policy_names[policy]) for policy in policies if _is_idle(levels, policy)),
         *notes_on(levels.values()),
-        f"{HOLM_NOTE} for {changes.name}." if any(change.differs for change in changes.values()) else "",
+        f"{HOLM_NOTE} for these {changes.tests} differences." if is_any_marked else "",
     ]
     reference_name = policy_names[reference]
     head = ["", *policy_names.values()]

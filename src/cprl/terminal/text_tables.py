@@ -143,6 +143,10 @@ def write_tables(tables: Sequence[TextTable], path: str | Path, *, notes: Sequen
 
     Args:
         notes: lines below all tables; a CSV has none.
+
+    Raises:
+        ValueError: for another suffix.
+        FileExistsError: if the file exists.
     """
     path = Path(path)
     if path.suffix not in WRITERS:

@@ -1,6 +1,6 @@
 """Population: the agents of an experiment that learn, follow a script, or were trained by an earlier run."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any, get_args
@@ -14,17 +14,16 @@ from cprl.algorithms.base import Algorithm, TeamAlgorithm, TrainingEngine
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import spaces_of
-from cprl.envs.unwrap import agent_names, commons_of
+from cprl.envs.unwrap import agent_names, commons_game_of
 from cprl.learners.lanes import Lanes
 from cprl.learners.protocol import AnyLearner
 from cprl.measuring.registry import OPTIONAL_ENTRIES, reported_by
 from cprl.networks.agent import acting_network
 from cprl.networks.recurrent import state_shape_of
 from cprl.objectives.rewards import reward_name
-from cprl.policies.actors import random_agents
 from cprl.policies.asking import Calls
-from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes, stored_decisions
-from cprl.policies.governors import Script, governor_spaces
+from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes
+from cprl.policies.governors import GovernorActor, Script, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_names, lane_seeds
@@ -38,6 +37,7 @@ from cprl.population import (
     Pool,
     Scripted,
     Team,
+    algorithm_name,
     grouped,
     refuse_people,
     refuse_sharing,
@@ -51,16 +51,19 @@ from cprl.training.stored import (
     StoredAgent,
     decision_values,
     load,
+    rule_follower,
     stored_actors,
+    stored_governor,
+    stored_policies,
     trained_agent,
 )
-from cprl.values import Custom, instantiate, short_repr
+from cprl.values import instantiate, short_repr
 
 
-def _refuse_only_in_play(spec: Learning | Team, env: EnvBase) -> None:
+def _refuse_only_in_play(learner: AnyLearner, env: EnvBase) -> None:
     """Raise a ValueError for `only_in_play` in a game without the entry "in_play"."""
-    settings = getattr(_algorithm_of(spec), "settings", None)
-    if getattr(settings, "only_in_play", False) and keys.IN_PLAY not in env.observation_spec.keys(True, True):
+    has_in_play = keys.IN_PLAY in env.observation_spec.keys(True, True)
+    if getattr(learner.settings, "only_in_play", False) and not has_in_play:
         raise ValueError(
             'settings.only_in_play is True; allowed in a game without the entry ("agents", "in_play"): False'
         )
@@ -110,8 +113,7 @@ class Population:
         self.seed = seed
         self.worlds = worlds
         self.replicas = env.batch_size.numel() // worlds
-        commons = commons_of(env)
-        self._game = None if commons is None else commons.game
+        self._game = commons_game_of(env)
         self.device = env.device or torch.device("cpu")
         groups = grouped(specs, self.spaces.agents)
         self._specs_by_agent: list[AgentSpec | GovernorSpec] = [*specs_by_agent(specs, self.spaces.agents)]
@@ -124,8 +126,8 @@ class Population:
         self.learners: dict[tuple[int, ...], AnyLearner] = {}
         for spec, agents in groups:
             if isinstance(spec, Learning | Team):
-                _refuse_only_in_play(spec, env)
-                self.learners[agents] = self._make_learner(spec, agents, engine, starts)
+                self.learners[agents] = self._make_learner(spec, agents, engine, self.spaces, starts=starts)
+                _refuse_only_in_play(self.learners[agents], env)
         self._pools: dict[int, PoolActor] = {}
         self._stored_agents = self._load_stored_agents(weights or {})
         self.governor = self._make_governor(governor, governor_from_turn)
@@ -153,53 +155,56 @@ class Population:
             decisions = self.decisions.without_exploration(
                 Purpose.EVALUATED_DECISIONS, replicas=self.replicas, worlds=worlds
             )
-        governor = None if self.governor is None else self.governor.evaluation_actor(worlds)
-        return JointPolicy(actors, decisions=decisions, governor=governor)
+        return JointPolicy(actors, decisions=decisions, governor=self.governor_actor(worlds))
 
     def random_policy(self, worlds: int) -> JointPolicy:
         """Return policies that take every action, and every choice of a decision, with equal probability."""
-        everyone = tuple(range(self.spaces.agents))
-        actors = random_agents(self.spaces, everyone, replicas=self.replicas, seed=self.seed, worlds=worlds)
-        if self._game is None:
-            return JointPolicy(actors)
-        decisions = stored_decisions(
-            self._game,
-            {},
+        agents = [[StoredAgent(scripted="random")] * self.replicas] * len(self._specs_by_agent)
+        return stored_policies(
+            agents,
+            self.playing,
             replicas=range(self.replicas),
             worlds=worlds,
             seed=self.seed,
             purpose=Purpose.RANDOM_PLAY,
+            decides=Purpose.RANDOM_PLAY,
         )
-        governor = None if self.governor is None else self.governor.random_actor(worlds)
-        return JointPolicy(actors, decisions=decisions, governor=governor)
+
+    def governor_actor(self, worlds: int) -> GovernorActor | None:
+        """Return an actor of the current governor for several worlds of each replica; None without one."""
+        if self.governor is None or self.governor.learner is None:
+            return self._stored_governor(Purpose.EVALUATION, worlds)
+        return GovernorActor(self.governor.actor.governor, self.governor.learner.evaluation_actor(worlds))
+
+    def _stored_governor(self, purpose: Purpose, worlds: int) -> GovernorActor | None:
+        """Return the actor of a governor that does not learn, with random numbers for a purpose."""
+        stored = self._stored_agents.get(self.spaces.agents, ())
+        return stored_governor(stored, self.playing, seeds=self._seeds(purpose), worlds=worlds)
 
     def networks(self) -> dict[str, nn.Module]:
         """Return copies of the learners' current acting networks, by "replica_0/agent_0" and so on, and the
         networks of past selves, see `PoolActor.networks`."""
         networks: dict[str, nn.Module] = {}
-        governors = {} if self.governor is None else self.governor.learners
-        for learner in [*self.learners.values(), *governors.values()]:
+        governors = [] if self.governor is None else [self.governor.learner]
+        for learner in filter(None, [*self.learners.values(), *governors]):
             networks |= learner.networks()
         for pool in self._pools.values():
             networks |= pool.networks()
         return networks
 
     def _make_governor(self, spec: GovernorSpec | None, from_turn: int) -> Governing | None:
-        if spec is None:
+        if self._game is None or self._game.governor is None:
             return None
-        assert self._game is not None
-        agent = self.spaces.agents
-        lanes = Lanes(
-            governor_spaces(self._game),
-            agents=(agent,),
-            replicas=self.replicas,
-            worlds=self.worlds,
-            seed=self.seed,
-            first_replica=self._replica_numbers.start,
-            device=self.device,
-        )
-        stored = self._stored_agents.get(agent, ())
-        return Governing(self._game, spec, lanes, stored=stored, from_turn=from_turn)
+        actor = self._stored_governor(Purpose.EXPLORATION, self.worlds)
+        learner = None
+        if isinstance(spec, Learning):
+            spaces = governor_spaces(self._game)
+            learner = self._make_learner(spec, (self.spaces.agents,), "eager", spaces)
+            actor = GovernorActor(self._game.governor, learner.actor)
+        if actor is None:
+            return None
+        actor.from_turn = from_turn
+        return Governing(self._game, actor, learner)
 
     def as_stored(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
         """Return copies of the current agents of some replicas, by agent and replica; the governor, if there
@@ -224,24 +229,20 @@ class Population:
         def frozen(spec: Frozen, *, governs: bool = False) -> list[StoredAgent]:
             if spec.run not in runs:
                 runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
-                if not governs:
-                    _refuse_other_game(runs[spec.run], self.spaces, self._game, is_to_decide=True)
+            run = runs[spec.run]
             if governs:
-                _refuse_other_governor(runs[spec.run], spec, self._game)
+                _refuse_other_governor(run, spec, self._game)
+            else:
+                _refuse_other_game(run, self.spaces, self._game, is_to_decide=True)
             replicas = map(spec.replica_for, self._replica_numbers)
-            stored = [runs[spec.run].agent(spec.agent, replica=replica) for replica in replicas]
+            stored = [run.agent(spec.agent, replica=replica) for replica in replicas]
             return [replace(one, calls=self.calls) for one in stored]
 
-        seeds = partial(lane_seeds, self.seed, replicas=self._replica_numbers, purpose=Purpose.EXPLORATION)
+        seeds = self._seeds(Purpose.EXPLORATION)
         agents: dict[int, list[StoredAgent]] = {}
         for agent, spec in enumerate(self._specs_by_agent):
-            if isinstance(spec, Scripted):
-                agents[agent] = [StoredAgent(scripted=spec.policy)] * self.replicas
-            elif isinstance(spec, Script):
-                agents[agent] = [StoredAgent(scripted=spec)] * self.replicas
-            elif isinstance(spec, Language):
-                stored = StoredAgent(scripted=spec.fallback, language=spec, calls=self.calls)
-                agents[agent] = [stored] * self.replicas
+            if isinstance(spec, Script | Scripted | Language):
+                agents[agent] = [rule_follower(spec, self.calls)] * self.replicas
             elif isinstance(spec, Frozen):
                 agents[agent] = frozen(spec, governs=agent == self.spaces.agents)
             elif isinstance(spec, Pool):
@@ -281,21 +282,26 @@ class Population:
         """
         numbers = self._replica_numbers[:replicas]
         others = self._others_as_stored()
-        others.pop(self.spaces.agents, None)  # the governor is no agent
-        agents = {agent: stored[: len(numbers)] for agent, stored in others.items()}
+        agents = {
+            agent: stored[: len(numbers)] for agent, stored in others.items() if agent < self.spaces.agents
+        }
         kinds = {
             agent: (getattr(self._specs_by_agent[agent], "run", None), stored[0].kind)
             for agent, stored in agents.items()
         }
-        seeds = partial(lane_seeds, self.seed, replicas=numbers, purpose=purpose)
         return stored_actors(
             agents,
             self.playing,
             kinds=kinds,
-            seeds=seeds,
+            seeds=self._seeds(purpose, replicas),
             worlds=worlds,
             asks=purpose is not Purpose.EXHIBITION,  # viewers cost no calls
         )
+
+    def _seeds(self, purpose: Purpose, replicas: int | None = None) -> Callable[..., list[tuple[int, ...]]]:
+        """Return a function of some `agents` that returns the seeds of their lanes for one purpose."""
+        numbers = self._replica_numbers[:replicas]
+        return partial(lane_seeds, self.seed, replicas=numbers, purpose=purpose)
 
     def _make_decider(self) -> BanditDecider | None:
         sizes = () if self._game is None else ballot_sizes(self._game)
@@ -317,11 +323,17 @@ class Population:
         )
 
     def _make_learner(
-        self, spec: Learning | Team, agents: tuple[int, ...], engine: Any, starts: bool
+        self,
+        spec: Learning | Team,
+        agents: tuple[int, ...],
+        engine: Any,
+        spaces: Spaces,
+        *,
+        starts: bool = False,
     ) -> AnyLearner:
         start_from = self._start_weights(spec, agents) if starts else {}
         lanes = Lanes(
-            self.spaces,
+            spaces,
             agents=agents,
             replicas=self.replicas,
             worlds=self.worlds,
@@ -335,7 +347,7 @@ class Population:
         learner = _algorithm_of(spec).make_learner(lanes, engine)
         if learner.rewards.reward != spec.reward and not isinstance(spec.reward, str):
             raise ValueError(
-                f"reward is {reward_name(spec.reward)}, which the learner of {_algorithm_name(spec)} does "
+                f"reward is {reward_name(spec.reward)}, which the learner of {algorithm_name(spec)} does "
                 "not have as its `rewards`; allowed for it: 'individual', 'team'"
             )
         return learner
@@ -386,7 +398,7 @@ def refuse_other_worlds(earlier: EnvBase, env: EnvBase, name: str, others: Itera
     Args:
         others: the actors of the agents that do not learn; scripted ones go by rules of `env`.
     """
-    games = [None if commons is None else commons.game for commons in map(commons_of, (earlier, env))]
+    games = commons_game_of(earlier), commons_game_of(env)
     pairs: dict[str, tuple[Any, Any]] = {"agents": (agent_names(earlier), agent_names(env))}
     pairs["a board of cprl:"] = games[0] is not None, games[1] is not None
     reported = [reported_by(worlds) for worlds in (earlier, env)]
@@ -418,11 +430,18 @@ def _refuse_other_game(
 
 
 def _refuse_other_governor(run: LoadedRun, spec: Frozen, game: Any) -> None:
-    """Refuse a stored governor that sees or chooses from something else than that of the game."""
-    pair = _sees_and_options(run.game), _sees_and_options(game)
-    _refuse_unequal(f"the game of {run.path}", "has", {"a governor that sees and chooses from": pair})
-    if spec.agent != run.game.agents:
-        raise ValueError(f"governor is {spec}; allowed: the agent after the last one, {run.game.agents}")
+    """Refuse a stored agent that is no governor, or sees or chooses from something else than that of the
+    game."""
+    if not spec.agent == run.game.agents < len(run.all_specs):
+        raise ValueError(
+            f"governor is {spec}; allowed: the governor of a run, as the agent after the last one"
+        )
+    stored = run.game.governor
+    pairs = {
+        "a governor that sees": (stored.sees, game.governor.sees),
+        "a governor with the options": (stored.options, game.governor.options),
+    }
+    _refuse_unequal(f"the game of {run.path}", "has", pairs)
 
 
 def _pairs(
@@ -450,11 +469,6 @@ def _refuse_unequal(subject: str, verb: str, pairs: Mapping[str, tuple[Any, Any]
     for name, (there, here) in pairs.items():
         if there != here:
             raise ValueError(f"{subject} {verb} {name} {there}; this game has {here}")
-
-
-def _sees_and_options(game: Any) -> Any:
-    governor = getattr(game, "governor", None)
-    return None if governor is None else (governor.sees, governor.options)
 
 
 def _ballot_choices(game: Game) -> list[tuple[str, tuple[float, ...]]]:
@@ -523,12 +537,8 @@ def _algorithm_of(spec: Learning | Team) -> Algorithm:
     algorithm = instantiate(spec.algorithm)
     if not isinstance(algorithm, kind):
         raise ValueError(
-            f"the algorithm of {_algorithm_name(spec)} is a {type(algorithm).__name__}; allowed: a subclass "
+            f"the algorithm of {algorithm_name(spec)} is a {type(algorithm).__name__}; allowed: a subclass "
             f"of cprl.algorithms.{kind.__name__}"
         )
     refuse_sharing(algorithm, is_sharing)
     return algorithm
-
-
-def _algorithm_name(spec: Learning | Team) -> str:
-    return spec.algorithm.target if isinstance(spec.algorithm, Custom) else type(spec.algorithm).__name__

@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from cprl.commons.game import Game
 from cprl.envs.env_state import load_transforms_state, transforms_state
 from cprl.envs.make_env import PlayableGame, make_env
-from cprl.envs.unwrap import commons_of
+from cprl.envs.unwrap import commons_game_of
 from cprl.experiment import Experiment
 from cprl.experiment.engine import engine_of
 from cprl.measuring.playing import Policy, evaluate
@@ -191,15 +191,8 @@ class Evaluations:
             env = make_worlds(experiment, len(group) * worlds, first=group[0] * worlds, fresh=True)
             load_transforms_state(env, transforms_state(self._env))
             stored = self._population.as_stored(group)
-            agents = self._population.spaces.agents
-            policies = stored_policies(
-                stored[:agents],
-                self._population.playing,
-                replicas=group,
-                worlds=worlds,
-                seed=seed,
-                governor=stored[agents] if len(stored) > agents else (),
-            )
+            playing = self._population.playing
+            policies = stored_policies(stored, playing, replicas=group, worlds=worlds, seed=seed)
             episodes = evaluate(env, policies, metrics=experiment.metrics)
             for index, replica in enumerate(group):
                 played[replica] = episodes[index * worlds : (index + 1) * worlds]
@@ -237,8 +230,8 @@ def is_repeatable(experiment: Experiment) -> bool:
 
 
 def _keeps_decisions(env: EnvBase) -> bool:
-    commons = commons_of(env)
-    return commons is not None and any(ballot.period_episodes != 1 for ballot in commons.game.in_force)
+    game = commons_game_of(env)
+    return game is not None and any(ballot.period_episodes != 1 for ballot in game.in_force)
 
 
 def evaluate_population(

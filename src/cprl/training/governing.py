@@ -1,6 +1,6 @@
 """A governor in a training: it decides, and learns from periods of many turns, at its own clock."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -11,20 +11,17 @@ from torch import Tensor
 from cprl import keys
 from cprl.commons.game import Game
 from cprl.keys import Turn
-from cprl.learners.lanes import Lanes
-from cprl.learners.learner import Learner
+from cprl.learners.protocol import AnyLearner
 from cprl.measuring.social import incomes_of
 from cprl.measuring.welfare import welfare
-from cprl.policies.actors import LaneActor
 from cprl.policies.governors import GovernorActor
-from cprl.policies.rng import Purpose
-from cprl.population import GovernorSpec, Learning
-from cprl.training.stored import StoredAgent, stored_governor
-from cprl.values import instantiate
 from cprl.values.array_types import AnyArray
 
-_AT_THE_LAST: Final = (keys.SEEN, keys.STOCK, keys.DONE, keys.TERMINATED)
-"""The entries of worlds that are kept of a period: "seen" [B, S]; "stock", "done" and "terminated" [B, 1]."""
+_COUNTED: Final = (
+    *(keys.SEEN, keys.STOCK, keys.DONE, keys.TERMINATED),
+    *(keys.HARVEST, keys.FINES, keys.TRANSFERS),
+)
+"""The entries of a turn that a period is counted from."""
 
 
 class Governing:
@@ -37,60 +34,39 @@ class Governing:
 
     Args:
         game: the game with the governor.
-        spec: how it decides.
-        lanes: the governor as the agent after the last one, see `governor_spaces`.
-        stored: the governor of each replica; () if it learns.
-        from_turn: the turns before its first decision.
+        actor: decides in the training.
+        learner: learns, as the agent after the last one; None for a governor that does not learn.
     """
 
-    def __init__(
-        self,
-        game: Game,
-        spec: GovernorSpec,
-        lanes: Lanes,
-        *,
-        stored: Sequence[StoredAgent] = (),
-        from_turn: int = 0,
-    ) -> None:
-        assert game.governor is not None
+    def __init__(self, game: Game, actor: GovernorActor, learner: AnyLearner | None) -> None:
         self._game = game
-        self._governor = game.governor
-        self._lanes = lanes
-        self._stored = stored
-        self.learner: Learner | None = None
-        """Learns, as the agent after the last one; None for a governor that does not learn."""
-        if isinstance(spec, Learning):
-            self.learner = instantiate(spec.algorithm).make_learner(lanes, "eager")
-            self.actor = GovernorActor(self._governor, self.learner.actor)
-        else:
-            self.actor = self._stored_actor(Purpose.EXPLORATION, lanes.worlds)
-        self.actor.from_turn = from_turn
+        self.actor = actor
+        self.learner = learner
         self._period: dict[str, AnyArray] = {}
-        """Of the turns of this period that count, by name: "income" [B, N] and "steps" [B], their sums;
-        `_AT_THE_LAST`, as it is after the last of them. Empty before the first."""
-        self._loss = torch.full((lanes.replicas, 1), float("nan"))
+        """Of the turns of this period that count, by name: "income" [B, N] and "steps" [B, 1], their sums;
+        "seen" [B, S], "stock", "done" and "terminated" [B, 1], as they are after the last of them. Empty
+        before the first."""
+        self._loss = torch.full((0 if learner is None else learner.replicas, 1), float("nan"))
         """The loss of the last update of each replica, [R, 1]; NaN before the first."""
 
     def store(self, turn: Turn) -> None:
         """Count a turn, and learn at the end of a period, if the governor learns."""
         if self.learner is None or self.actor.seen is None:
             return
-        now = {name: _copied(turn.next_world[name]) for name in _AT_THE_LAST}
-        paid = [_copied(turn.next_agents[key[-1]]) for key in (keys.HARVEST, keys.FINES, keys.TRANSFERS)]
-        now["income"] = incomes_of(*paid)
-        now["steps"] = np.ones(len(now["income"]), np.int64)
-        if self._period:
-            for name in ("income", "steps"):
-                now[name] += self._period[name]
-            ended = self._period[keys.DONE][:, 0]
-            for name, entry in now.items():
-                entry[ended] = self._period[name][ended]
+        before = self._period
+        now = turn.batch["next"].select(*_COUNTED).cpu().numpy()
+        now["income"] = incomes_of(**now.pop(keys.AGENTS))
+        now["steps"] = np.ones_like(now[keys.STOCK])
+        if before:
+            now["income"] += before["income"]
+            now["steps"] += before["steps"]
+            now = {name: np.where(before[keys.DONE], before[name], entry) for name, entry in now.items()}
         self._period = now
-        if self.actor.turns % self._governor.every_steps == 0:
+        if self.actor.is_due:
             self._learn(self.learner)
             self._period = {}
 
-    def _learn(self, learner: Learner) -> None:
+    def _learn(self, learner: AnyLearner) -> None:
         """Learn from the period that has ended."""
         batch = self._transitions()
         learner.store(batch)
@@ -104,7 +80,7 @@ class Governing:
         assert self.actor.seen is not None
         assert self.actor.rule is not None
         period = self._period
-        reward = welfare(self._game, period["income"], period["steps"], period[keys.STOCK][:, 0])
+        reward = welfare(self._game, period["income"], period["steps"][:, 0], period[keys.STOCK][:, 0])
         entries = {
             keys.OBSERVATION: self._as_last(self.actor.seen),
             keys.ACTION: self._as_last(self.actor.rule),
@@ -128,33 +104,11 @@ class Governing:
             "governor/epsilon": self.learner.actor.epsilon,
         }
 
-    @property
-    def learners(self) -> dict[tuple[int, ...], Learner]:
-        """Return its learner by the agent after the last one; {} if it does not learn."""
-        return {} if self.learner is None else {self.learner.agents: self.learner}
-
-    def evaluation_actor(self, worlds: int) -> GovernorActor:
-        """Return an actor of the current governor for several worlds of each replica."""
-        if self.learner is None:
-            return self._stored_actor(Purpose.EVALUATION, worlds)
-        return GovernorActor(self._governor, self.learner.evaluation_actor(worlds))
-
-    def random_actor(self, worlds: int) -> GovernorActor:
-        """Return an actor that decides at random, for several worlds of each replica."""
-        options = len(self._governor.options)
-        seeds = self._lanes.agent_seeds(Purpose.RANDOM_PLAY)
-        return GovernorActor(self._governor, LaneActor(None, options, seeds=seeds, agents=1, worlds=worlds))
-
-    def _stored_actor(self, purpose: Purpose, worlds: int) -> GovernorActor:
-        """Return the actor of a governor that does not learn, with random numbers for a purpose."""
-        seeds = self._lanes.agent_seeds(purpose)
-        return stored_governor(self._game, self._stored, seeds=seeds, worlds=worlds)
-
     def state_dict(self) -> dict[str, Any]:
         return {
             "actor": self.actor.state_dict(),
             "learner": None if self.learner is None else self.learner.state_dict(),
-            "period": {name: torch.tensor(array) for name, array in self._period.items()},
+            "period": {name: torch.from_numpy(array) for name, array in self._period.items()},
             "loss": self._loss,
         }
 
@@ -162,10 +116,6 @@ class Governing:
         self.actor.load_state_dict(state["actor"])
         if self.learner is not None:
             self.learner.load_state_dict(state["learner"])
-        self._period = {name: tensor.numpy().copy() for name, tensor in state["period"].items()}
-        self._loss = state["loss"].clone()
-
-
-def _copied(entry: Any) -> AnyArray:
-    """Return a copy of an entry of a turn, as a numpy array."""
-    return torch.as_tensor(entry).clone().numpy(force=True)
+        period = state["period"]
+        self._period = {name: entry.view(len(entry), -1).numpy() for name, entry in period.items()}
+        self._loss = state["loss"]

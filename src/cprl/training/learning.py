@@ -1,4 +1,4 @@
-"""What a training keeps of its learners in each episode, and checks of its agents."""
+"""What a training keeps of its learners in each episode, and checks of its learners and decisions."""
 
 from collections.abc import Mapping, Sequence
 from math import nan
@@ -6,13 +6,13 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs import EnvBase
 
+from cprl.commons.game import Game
 from cprl.keys import Turn
 from cprl.learners.protocol import AnyLearner
 from cprl.policies.decisions import Decider
-from cprl.policies.joint_policy import ActorAgents, agent_indices
 from cprl.values.array_types import Float64
 
 Learners: TypeAlias = Mapping[tuple[int, ...], AnyLearner]
@@ -113,27 +113,15 @@ def learning_numbers(
     return by_episode
 
 
-def check_agents(
-    env: EnvBase,
-    agents: int,
-    worlds: int,
-    learners: Learners,
-    others: Mapping[ActorAgents, nn.Module],
-) -> int:
-    """Return the number of replicas R; raise a ValueError unless each of N agents has one learner or actor,
-    for W worlds of each replica."""
+def check_learners(env: EnvBase, worlds: int, learners: Learners) -> int:
+    """Return the number of replicas R; raise a ValueError unless all learners are made for them, and for W
+    worlds of each."""
     all_worlds: int = env.batch_size.numel()
     if all_worlds % worlds:
         raise ValueError(f"worlds is {worlds}; allowed: a divisor of the environment's {all_worlds} worlds")
     replicas = all_worlds // worlds
-    controlled = sorted(agent for indices in [*learners, *others] for agent in agent_indices(indices))
-    if controlled != list(range(agents)):
-        raise ValueError(
-            f"learners and others control the agents {controlled}; allowed: each of 0 to {agents - 1} "
-            "exactly once"
-        )
     for indices, learner in learners.items():
-        if learner.agents != agent_indices(indices):
+        if learner.agents != indices:
             raise ValueError(f"a learner made for the agents {learner.agents} is given for {indices}")
         if (learner.replicas, learner.worlds) != (replicas, worlds):
             raise ValueError(
@@ -143,8 +131,9 @@ def check_agents(
     return replicas
 
 
-def check_decisions(decisions: Decider | None, options: int) -> None:
+def check_decisions(decisions: Decider | None, game: Game | None) -> None:
     """Raise a ValueError if agents have options on ballots but no Decider, or a Decider but no options."""
+    options = 0 if game is None else game.decisions
     if options and decisions is None:
         raise ValueError(
             "decisions is None; allowed for a game whose agents vote or elect: a Decider, e.g. "

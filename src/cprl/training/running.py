@@ -150,7 +150,12 @@ def run(
                 return directory
             opened.population.calls.keep_in(directory / CALLS)
             viewer = viewer_stack.enter_context(_make_viewer(watch, opened))
-            _Stages(opened, viewer).take_all(checkpointer, times, figures=figures)
+            random_episodes = _play_at_random(opened, viewer)
+            training = _train(opened, viewer, checkpointer)
+            evaluation = _evaluate(opened, viewer, random_episodes)
+            figure = _draw_curve(opened, training, evaluation) if figures else None
+            _write_report(directory, training, times)
+            _summarise(opened, training, evaluation, figure)
             checkpointer.done()
             _say_kept_state(opened)
         for observer in opened.observers:
@@ -347,118 +352,104 @@ def _loggers(experiment: Experiment, directory: Path, *, resumes: bool) -> Itera
         yield [stack.enter_context(LoggerCallback(logger, resumes=resumes)) for logger in loggers]
 
 
-@dataclass(frozen=True, eq=False)
-class _Stages:
-    """The stages of an open run: random play, training, evaluation, and the report."""
+def _play_at_random(run: _OpenRun, viewer: "ViewerCallback | None") -> list[Episode] | None:
+    """Play at random, for comparison with the training, and show it in the viewer.
 
-    run: _OpenRun
-    viewer: "ViewerCallback | None"
+    Returns:
+        The episodes; None without a viewer, since nobody would see them during the training.
+    """
+    if viewer is None:
+        return None
+    episodes = random_play(run.experiment, run.population, seen=viewer.seen_at_random)
+    viewer.random_play(episodes)
+    return episodes
 
-    def take_all(self, checkpointer: Checkpointer, times: Times, *, figures: bool) -> None:
-        """Take all stages, from random play to the printed summary."""
-        random_episodes = self.play_at_random()
-        training = self.train(checkpointer)
-        evaluation = self.evaluate(random_episodes)
-        figure = self.draw_curve(training, evaluation) if figures else None
-        _write_report(self.run.directory, training, times)
-        self.summarise(training, evaluation, figure)
 
-    def play_at_random(self) -> list[Episode] | None:
-        """Play at random, for comparison with the training, and show it in the viewer.
+def _train(run: _OpenRun, viewer: "ViewerCallback | None", checkpointer: Checkpointer) -> Training:
+    """Train, and save what the agents have learned."""
+    viewers = [] if viewer is None else [viewer]
+    evaluations = Evaluations(run.directory, run.experiment, run.env, run.population)
+    with _loggers(run.experiment, run.directory, resumes=run.resume) as loggers:
+        table = EpisodeTable(run.directory / "episodes.parquet", resumable=True)
+        with table, ProgressBar.of(run.experiment, run.population.calls.in_words) as progress_bar:
+            training = train(
+                run.env,
+                run.population.learners,
+                run.experiment.schedule,
+                others=run.population.others,
+                decisions=run.population.decisions,
+                governor=run.population.governor,
+                callbacks=[evaluations, table, progress_bar, *run.observers, *viewers, *loggers],
+                metrics=run.experiment.metrics,
+                earlier=run.earlier,
+                checkpointer=checkpointer,
+            )
+            _save_learned(run)
+    return training
 
-        Returns:
-            The episodes; None without a viewer, since nobody would see them during the training.
-        """
-        if self.viewer is None:
-            return None
-        episodes = random_play(self.run.experiment, self.run.population, seen=self.viewer.seen_at_random)
-        self.viewer.random_play(episodes)
-        return episodes
 
-    def train(self, checkpointer: Checkpointer) -> Training:
-        """Train, and save what the agents have learned."""
-        run = self.run
-        viewers = [] if self.viewer is None else [self.viewer]
-        evaluations = Evaluations(run.directory, run.experiment, run.env, run.population)
-        with _loggers(run.experiment, run.directory, resumes=run.resume) as loggers:
-            table = EpisodeTable(run.directory / "episodes.parquet", resumable=True)
-            with table, ProgressBar.of(run.experiment, run.population.calls.in_words) as progress_bar:
-                training = train(
-                    run.env,
-                    run.population.learners,
-                    run.experiment.schedule,
-                    others=run.population.others,
-                    decisions=run.population.decisions,
-                    governor=run.population.governor,
-                    callbacks=[evaluations, table, progress_bar, *run.observers, *viewers, *loggers],
-                    metrics=run.experiment.metrics,
-                    earlier=run.earlier,
-                    checkpointer=checkpointer,
-                )
-                self.save_learned()
-        return training
+def _save_learned(run: _OpenRun) -> None:
+    """Save the weights of the agents' networks, and the states of transforms and decisions."""
+    save_weights(run.directory, run.population.networks())
+    save_beside_weights(run.directory, TRANSFORMS, transforms_state(run.env))
+    if run.population.decisions is not None:
+        save_beside_weights(run.directory, DECISIONS, run.population.decisions.learned())
 
-    def save_learned(self) -> None:
-        """Save the weights of the agents' networks, and the states of transforms and decisions."""
-        directory = self.run.directory
-        population = self.run.population
-        save_weights(directory, population.networks())
-        save_beside_weights(directory, TRANSFORMS, transforms_state(self.run.env))
-        if population.decisions is not None:
-            save_beside_weights(directory, DECISIONS, population.decisions.learned())
 
-    def evaluate(self, random_episodes: list[Episode] | None) -> pa.Table:
-        """Let the agents play fresh worlds, write their episodes, and show them in the viewer.
+def _evaluate(
+    run: _OpenRun, viewer: "ViewerCallback | None", random_episodes: list[Episode] | None
+) -> pa.Table:
+    """Let the agents play fresh worlds, write their episodes, and show them in the viewer.
 
-        Args:
-            random_episodes: the episodes of `play_at_random`.
+    Args:
+        random_episodes: the episodes of `_play_at_random`.
 
-        Returns:
-            The episodes of random play and of the trained agents, labelled by "policy".
-        """
-        run = self.run
-        if self.viewer is not None:
-            self.viewer.flush()
-        episodes = evaluate_population(run.experiment, run.env, run.population, random=random_episodes)
-        tables = write_evaluation(run.directory, episodes, replicas=run.experiment.replicas)
-        if self.viewer is not None:
-            self.viewer.finished(episodes)
-        trained = _trained_label(list(run.population.learners.values()))
-        random_table = labelled(tables["random"], policy="random")
-        trained_table = labelled(tables["trained"], policy=trained)
-        return store_agent_names(pa.concat_tables([random_table, trained_table]), agent_names(run.env))
+    Returns:
+        The episodes of random play and of the trained agents, labelled by "policy".
+    """
+    if viewer is not None:
+        viewer.flush()
+    episodes = evaluate_population(run.experiment, run.env, run.population, random=random_episodes)
+    tables = write_evaluation(run.directory, episodes, replicas=run.experiment.replicas)
+    if viewer is not None:
+        viewer.finished(episodes)
+    trained = _trained_label(list(run.population.learners.values()))
+    random_table = labelled(tables["random"], policy="random")
+    trained_table = labelled(tables["trained"], policy=trained)
+    return store_agent_names(pa.concat_tables([random_table, trained_table]), agent_names(run.env))
 
-    @working("drawing the training curve")
-    def draw_curve(self, training: Training, evaluation: pa.Table) -> Path | None:
-        """Draw the training curve, and return its file; None if a replica has ended no episode."""
-        experiment = self.run.experiment
-        if not all(training.episodes_by_replica):
-            say(f"No training curve: a replica has ended no episode in {training.steps:,} steps")
-            return None
-        steps = exploration_steps(experiment.agents)
-        return training_curve(
-            self.run.directory,
-            title=experiment.title,
-            random=where(evaluation, policy="random"),
-            exploration_turns=None if steps is None else steps / experiment.worlds,
-        )
 
-    def summarise(self, training: Training, evaluation: pa.Table, figure: Path | None) -> None:
-        """Print the summary of the run."""
-        experiment = self.run.experiment
-        calls = self.run.population.calls.in_words()
-        notes = filter(None, (findings_note(training.finite.reported), experiment.custom_code, calls))
-        course = ""
-        if all(training.episodes_by_replica) and set(NEEDED) <= set(evaluation.column_names):
-            course = course_of(self.run.directory, experiment.agents)
-        summarise(
-            self.run.directory,
-            title=experiment.title,
-            played=evaluation,
-            course=course,
-            figure=figure,
-            note="\n".join(notes) or None,
-        )
+@working("drawing the training curve")
+def _draw_curve(run: _OpenRun, training: Training, evaluation: pa.Table) -> Path | None:
+    """Draw the training curve, and return its file; None if a replica has ended no episode."""
+    if not all(training.episodes_by_replica):
+        say(f"No training curve: a replica has ended no episode in {training.steps:,} steps")
+        return None
+    steps = exploration_steps(run.experiment.agents)
+    return training_curve(
+        run.directory,
+        title=run.experiment.title,
+        random=where(evaluation, policy="random"),
+        exploration_turns=None if steps is None else steps / run.experiment.worlds,
+    )
+
+
+def _summarise(run: _OpenRun, training: Training, evaluation: pa.Table, figure: Path | None) -> None:
+    """Print the summary of the run."""
+    experiment = run.experiment
+    calls = run.population.calls.in_words()
+    notes = filter(None, (findings_note(training.finite.reported), experiment.custom_code, calls))
+    course = ""
+    if all(training.episodes_by_replica) and set(NEEDED) <= set(evaluation.column_names):
+        course = course_of(run.directory, experiment.agents)
+    summarise(
+        run.directory,
+        title=experiment.title,
+        played=evaluation,
+        course=course,
+        figure=figure,
+        note="\n".join(notes) or None,
+    )
 
 
 def _trained_label(learners: Sequence[AnyLearner]) -> str:

@@ -130,11 +130,11 @@ class LoadedRun:
         governor = self.experiment.governor
         return self.specs if governor is None else [*self.specs, governor]
 
-    def governor(self, replicas: Sequence[int]) -> list[StoredAgent]:
-        """Return the governor of each of some replicas; [] without one."""
+    def governor(self, replicas: Sequence[int]) -> list[list[StoredAgent]]:
+        """Return a list of the governor of each of some replicas; [] without one."""
         if self.experiment.governor is None:
             return []
-        return [self.agent(self.game.agents, replica=replica) for replica in replicas]
+        return [[self.agent(self.game.agents, replica=replica) for replica in replicas]]
 
     @cached_property
     def spaces(self) -> Spaces:
@@ -177,12 +177,8 @@ class LoadedRun:
         if not 0 <= agent < len(specs):
             raise ValueError(f"agent is {agent}; {self.path} has the agents 0 to {len(specs) - 1}")
         spec = specs[agent]
-        if isinstance(spec, Script):
-            return StoredAgent(scripted=spec)
-        if isinstance(spec, Scripted):
-            return StoredAgent(scripted=spec.policy)
-        if isinstance(spec, Language):
-            return StoredAgent(scripted=spec.fallback, language=spec, calls=self.calls)
+        if isinstance(spec, Script | Scripted | Language):
+            return rule_follower(spec, self.calls)
         if isinstance(spec, Person):
             raise ValueError(
                 f"agent {agent} of {self.path} is a person: people cannot be played again; allowed: cprl "
@@ -228,15 +224,8 @@ class LoadedRun:
     def policy(self, replica: int = 0, *, worlds: int = 1, seed: int = 0) -> JointPolicy:
         """Return the policies of a replica's agents for several worlds; trained agents explore as in
         evaluation if asked to, with random numbers from the seed."""
-        agents = [[self.agent(agent, replica=replica)] for agent in range(self.game.agents)]
-        return stored_policies(
-            agents,
-            self.playing,
-            replicas=[replica],
-            worlds=worlds,
-            seed=seed,
-            governor=self.governor([replica]),
-        )
+        agents = [[self.agent(agent, replica=replica)] for agent in range(len(self.all_specs))]
+        return stored_policies(agents, self.playing, replicas=[replica], worlds=worlds, seed=seed)
 
     def episodes(self) -> pa.Table:
         """Return the table of episodes; see `cprl.runs.episodes.read_episodes`."""
@@ -357,6 +346,13 @@ def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module
     return networks
 
 
+def rule_follower(spec: Script | Scripted | Language, calls: Calls) -> StoredAgent:
+    """Return an agent that follows a script, or plans by a language model whose calls `calls` keeps."""
+    if isinstance(spec, Language):
+        return StoredAgent(scripted=spec.fallback, language=spec, calls=calls)
+    return StoredAgent(scripted=spec.policy if isinstance(spec, Scripted) else spec)
+
+
 def trained_agent(spec: Learning | Team, network: nn.Module, decisions: Tensor | None) -> StoredAgent:
     """Return an agent that has learned, with its network and the values of its decisions."""
     algorithm = instantiate(spec.algorithm)
@@ -385,53 +381,53 @@ def stored_policies(
     replicas: Sequence[int],
     worlds: int,
     seed: int,
-    governor: Sequence[StoredAgent] = (),
+    purpose: Purpose = Purpose.EVALUATION,
+    decides: Purpose = Purpose.EVALUATED_DECISIONS,
 ) -> JointPolicy:
     """Return the policies of stored agents of some replicas; agents of one kind are lanes of one actor.
 
     Args:
-        agents: the stored agents, by agent and replica.
-        seed: the seed of random numbers, with the replica and the agent.
-        governor: the stored governor of each replica; empty where the first option stays in force.
+        agents: the stored agents, by agent and replica; the governor, if one decides, comes last.
+        seed: the seed of random numbers, with the replica, the agent and the purpose.
+        purpose: the purpose of the random numbers of actions.
+        decides: that of the random numbers of decisions on ballots.
     """
     by_index = dict(enumerate(agents))
-    seeds = partial(lane_seeds, seed, replicas=replicas, purpose=Purpose.EVALUATION)
+    seeds = partial(lane_seeds, seed, replicas=replicas, purpose=purpose)
+    governor = stored_governor(by_index.pop(playing.agents, ()), playing, seeds=seeds, worlds=worlds)
     decisions = None
     if isinstance(playing, Game):
         stored = decision_values(by_index)
-        decisions = stored_decisions(playing, stored, replicas=replicas, worlds=worlds, seed=seed)
+        decisions = stored_decisions(
+            playing, stored, replicas=replicas, worlds=worlds, seed=seed, purpose=decides
+        )
     actors = stored_actors(by_index, playing, seeds=seeds, worlds=worlds, stacks=True)
-    governs = None
-    if isinstance(playing, Game) and governor:
-        lanes = seeds(agents=[playing.agents])
-        governs = stored_governor(playing, governor, seeds=lanes, worlds=worlds)
-    return JointPolicy(actors, decisions=decisions, governor=governs)
+    return JointPolicy(actors, decisions=decisions, governor=governor)
 
 
 def stored_governor(
-    game: Game,
     stored: Sequence[StoredAgent],
+    playing: Game | Spaces,
     *,
-    seeds: Sequence[Sequence[int]],
+    seeds: Callable[..., Sequence[Sequence[int]]],
     worlds: int,
-) -> GovernorActor:
+) -> GovernorActor | None:
     """Return the actor of a governor that does not learn.
 
     Args:
-        stored: the governor of each replica.
-        seeds: the seed of each replica.
+        stored: the governor of each replica; () for None, with which the first option stays in force.
+        seeds: see `stored_actors`.
     """
-    assert game.governor is not None
+    if not stored:
+        return None
+    assert isinstance(playing, Game)
+    assert playing.governor is not None
     by: Any = stored[0].scripted
-    if by is None:
-        (by,) = stored_actors(
-            {game.agents: stored},
-            governor_spaces(game),
-            seeds=lambda agents: seeds,
-            worlds=worlds,
-            stacks=True,
-        ).values()
-    return GovernorActor(game.governor, by)
+    if not isinstance(by, Script):
+        lanes = {playing.agents: stored}
+        actors = stored_actors(lanes, governor_spaces(playing), seeds=seeds, worlds=worlds, stacks=True)
+        (by,) = actors.values()
+    return GovernorActor(playing.governor, by)
 
 
 def decision_values(agents: Mapping[int, Sequence[StoredAgent]]) -> dict[int, list[Tensor]]:

@@ -20,7 +20,7 @@ from cprl import keys, recurrent_state
 from cprl.commons.spaces import Spaces
 from cprl.envs.env_state import env_state, load_env_state, load_transforms_state, transforms_state
 from cprl.envs.make_env import check_env, spaces_of
-from cprl.envs.unwrap import commons_of
+from cprl.envs.unwrap import commons_game_of
 from cprl.keys import Turn
 from cprl.learners.protocol import AnyLearner
 from cprl.measuring.series import Observer
@@ -35,8 +35,8 @@ from cprl.training.governing import Governing
 from cprl.training.learning import (
     LaneLosses,
     ShapedReturns,
-    check_agents,
     check_decisions,
+    check_learners,
     learning_numbers,
 )
 from cprl.training.nan_check import EVERY_TURNS, FiniteCheck
@@ -154,12 +154,10 @@ class Training:
         self.others = dict(others or {})
         self.decisions = decisions
         self.governor = governor
-        self.replicas = check_agents(env, spaces.agents, schedule.worlds, self.learners, self.others)
+        self.replicas = check_learners(env, schedule.worlds, self.learners)
         for learner in self.learners.values():
             schedule.refuse_rollouts(getattr(learner.settings, "rollout_steps", schedule.update_every))
-        commons = commons_of(env)
-        options = 0 if commons is None else commons.game.decisions
-        check_decisions(decisions, options)
+        check_decisions(decisions, commons_game_of(env))
         actors: dict[ActorAgents, nn.Module] = {
             agents: learner.actor for agents, learner in self.learners.items()
         }
@@ -168,6 +166,7 @@ class Training:
             decisions=decisions,
             governor=None if governor is None else governor.actor,
         )
+        policy.refuse_other_agents(spaces.agents)
         self._collector = make_collector(self.env, policy)
         if earlier and not isinstance(self._collector, StepCollector):
             raise ValueError(
@@ -182,7 +181,9 @@ class Training:
         self._shaped_returns = ShapedReturns(env.batch_size.numel(), spaces.agents, self.learners)
         for learner in self.learners.values():
             learner.begin()
-        all_learners = self.learners if governor is None else {**self.learners, **governor.learners}
+        all_learners = dict(self.learners)
+        if governor is not None and governor.learner is not None:
+            all_learners[governor.learner.agents] = governor.learner
         self.finite = FiniteCheck(all_learners, spaces, worlds=schedule.worlds, on_nan=schedule.on_nan)
         self.observer = Observer(callbacks, env, worlds=schedule.worlds)
         """The caller of the callbacks."""
@@ -322,9 +323,6 @@ class Training:
         has_ended[worlds] = True
         for learner in self.learners.values():
             learner.end_episode(has_ended)
-        if self.governor is not None:
-            for world, numbers in zip(worlds, learned, strict=True):
-                numbers |= self.governor.numbers(world // self.schedule.worlds)
         return learned
 
     def _record_episodes(self, ended: Sequence[Episode], learned: Sequence[dict[str, float]]) -> None:
@@ -332,6 +330,8 @@ class Training:
         recorded: list[tuple[Episode, dict[str, float]]] = []
         for episode, numbers in zip(ended, learned, strict=True):
             replica = episode.world // self.schedule.worlds
+            if self.governor is not None:
+                numbers |= self.governor.numbers(replica)
             shaped = self._shaped_returns.take(episode.world)
             number = self._ended_episodes[replica]
             episode = replace(episode, replica=replica, episode=number, wanted_return=shaped)
@@ -375,7 +375,7 @@ class Training:
             "learners": list(self.learners.values()),
             "others": list(self.others.values()),
             "decisions": [] if self.decisions is None else [self.decisions],
-            **({} if self.governor is None else {"governor": [self.governor]}),
+            "governor": [] if self.governor is None else [self.governor],
             "losses": list(self._losses.values()),
             "wanted": [self._shaped_returns],
             "tracker": [self._tracker],
@@ -425,7 +425,7 @@ class Training:
         if state["carried"] is not None:
             self._step_collector().carried = template.empty(recurse=True).update(state["carried"])
         for name, parts in self._stateful_parts().items():
-            for part, part_state in zip(parts, state[name], strict=True):
+            for part, part_state in zip(parts, state.get(name, ()), strict=True):
                 part.load_state_dict(part_state)
         for name, callback in self._stateful_callbacks().items():
             if name in state["callbacks"]:  # a resumed training may have another viewer
@@ -451,11 +451,11 @@ def _cut(batch: TensorDictBase) -> TensorDictBase:
 
 def _changes_between(before: EnvBase, now: EnvBase) -> str:
     """Return in words what differs between the games of two environments."""
-    commons_before = commons_of(before)
-    commons = commons_of(now)
-    if commons_before is None or commons is None:
+    game_before = commons_game_of(before)
+    game = commons_game_of(now)
+    if game_before is None or game is None:
         return "another game"
-    changes = describe_changes(to_config(commons_before.game), to_config(commons.game), "game")
+    changes = describe_changes(to_config(game_before), to_config(game), "game")
     return "; ".join(changes) or "the same game"
 
 

@@ -51,7 +51,7 @@ def fresh_result(episodes: Sequence[Episode], *, replicas: int = 1) -> FreshResu
     values = list(map(_income, episodes))
     harvest = estimate_if_finite(np.reshape(values, (replicas, -1)).mean(1).tolist())
     if COLLECTIVE_RETURN in episodes[0].metrics:
-        harvest = harvest.of(COLLECTIVE_RETURN)
+        harvest = harvest.bounded(COLLECTIVE_RETURN)
     died = [has_died(episode) for episode in episodes]
     deaths = None if None in died else sum(map(bool, died))
     return FreshResult(harvest=harvest, died=deaths, episodes=len(values))

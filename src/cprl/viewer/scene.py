@@ -14,7 +14,7 @@ from cprl.commons.cells import Colour
 from cprl.commons.game import Game
 from cprl.commons.quirks import self_stays
 from cprl.envs.commons_env import CommonsEnv
-from cprl.envs.unwrap import joint_actions
+from cprl.envs.unwrap import commons_game_of, joint_actions
 from cprl.measuring.registry import (
     AGENT_TOTALS,
     COLLECTIVE_RETURN,
@@ -23,8 +23,9 @@ from cprl.measuring.registry import (
     INSTITUTIONS,
     SOCIAL_METRICS,
     left_out_note,
+    metrics_for,
 )
-from cprl.measuring.tracker import decisions_of, metrics_of
+from cprl.measuring.tracker import decisions_of
 from cprl.values.array_types import Float32
 from cprl.viewer.names import TEXT
 
@@ -154,7 +155,7 @@ def plotted_numbers(
         replicas=env.batch_size.numel() // worlds,
         worlds=worlds,
         mean_over=worlds * ceil(mean_over / worlds),
-        metrics=(*metrics_of(env, reported), *user_metrics),
+        metrics=(*metrics_for(reported, commons_game_of(env)), *user_metrics),
         has_tags="tagged_by" in reported,
         in_force=in_force,
         joint=joint,

@@ -4,7 +4,7 @@ from dataclasses import replace
 from typing import Any, Final
 
 from cprl.commons.game import Game
-from cprl.commons.published import game as published_game
+from cprl.commons.named_games import game as published_game
 from cprl.institutions import Quota
 from cprl.web.playable import playable
 from cprl.web.scenes import compact_json, scene_json

@@ -421,7 +421,7 @@ class HostedRound:
         turns, apples = np.transpose([*averages.values()])
         trained: dict[str, Any] = {}
         for name, values in (("harvest", apples / self.game.agents), ("survival_steps", turns)):
-            mean = estimate_if_finite(values.tolist()).of(COLLECTIVE_RETURN)
+            mean = estimate_if_finite(values.tolist()).bounded(COLLECTIVE_RETURN)
             trained[name] = mean.value
             trained[f"{name}_interval"] = mean.interval if len(values) > 1 else None
         return trained

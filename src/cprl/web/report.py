@@ -3,7 +3,9 @@
 import json
 import re
 from base64 import b64encode
+from collections.abc import Mapping
 from html import escape
+from math import isnan
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -13,25 +15,39 @@ from markdown_it import MarkdownIt
 from cprl.commons.game import Game
 from cprl.evaluation.evaluate import evaluate_run
 from cprl.evaluation.fresh import fresh_episodes
+from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, title, unit
+from cprl.measuring.statistics import Estimate, number_format
 from cprl.measuring.table import complete, labelled
 from cprl.pictures.readable import capitalised, growth_of, meaning_of, rule_of, tag_of
 from cprl.population import has_people, learned
 from cprl.runs.curves import curves_of
 from cprl.runs.played import TURNS, absence
-from cprl.studies.results import SUMMARY, answer_of
-from cprl.studies.tables.tidy_table import StudyTable
+from cprl.studies.results import SUMMARY
+from cprl.studies.tables.comparing import (
+    compared_metrics,
+    condition_differences,
+    episodes_text,
+    pairing_text,
+)
+from cprl.studies.tables.effects import effect_weights, effects_of
+from cprl.studies.tables.tidy_table import EVALUATION_PART, StudyTable
 from cprl.system.defaults import SEED, STUDY_TABLE, Fresh
 from cprl.system.output import legible
 from cprl.system.working import working
 from cprl.terminal.course import NEEDED, course_of
 from cprl.terminal.figures import training_curve
 from cprl.terminal.summary import comparison_table
-from cprl.terminal.text_tables import markdown
+from cprl.terminal.text_tables import escape_cell, markdown
 from cprl.training.stored import LoadedRun, load
 from cprl.values.array_types import Float64
 from cprl.web.show import Page, data_of, page
 
 _LARGEST_SVG_BYTES: Final = 300_000
+_INCOME: Final = "**Income** of all agents together (harvest - fines + transfers), apples"
+_HARVEST: Final = "**Harvest** (collective return), apples"
+_NONE: Final = "no difference shown"
+_ALONE: Final = "not shown among so many, though it would be alone"
+_UNTOLD: Final = "cannot be told, as one replica has no interval"
 
 
 @working("making a report")
@@ -159,16 +175,16 @@ def _recipe(run: LoadedRun) -> str:
     """Return how it was begun, and how to run it again, which people cannot, as HTML."""
     recipe = json.dumps(run.recipe["experiment"], separators=(", ", ": "))
     began = escape(str(run.recipe.get("command", "")))
-    title = "The recipe"
+    heading = "The recipe"
     again = ""
     if not has_people(run.specs):
-        title = "Run it again"
+        heading = "Run it again"
         again = (
             "<p>Its directory alone is enough, too, or the recipe below as the <code>experiment</code> of a "
             "<code>recipe.json</code>:</p><pre>cprl run RUN --out AGAIN</pre>"
         )
     return (
-        f"<h2>{title}</h2><p>It was begun by this command line:</p><pre>{began}</pre>{again}"
+        f"<h2>{heading}</h2><p>It was begun by this command line:</p><pre>{began}</pre>{again}"
         f"<details><summary>The whole recipe</summary><pre>{escape(recipe)}</pre></details>"
     )
 
@@ -188,8 +204,8 @@ def _study_page(folder: Path) -> str:
     """Return the page of a study: its summary, with the answer and the figures."""
     table = StudyTable.read(folder / STUDY_TABLE)
     summary = (folder / SUMMARY).read_text(encoding="utf-8")
-    title, _, rest = summary.partition("\n")
-    answer = answer_of(table)
+    headline, _, rest = summary.partition("\n")
+    answer = _answer_of(table)
     head, mark, tail = rest.partition("\n## ")
     text = f"{head}\n\n**Answer.** {answer}\n{mark}{tail}" if answer else rest
 
@@ -199,7 +215,58 @@ def _study_page(folder: Path) -> str:
         return _figure(path.read_bytes(), "png", image[2]) if is_ours and path.is_file() else ""
 
     body = re.sub(r'<p><img src="([^"]*)" alt="([^"]*)"\s*/?></p>', picture, _html(text))
-    return page(legible(title.lstrip("# ")), body)
+    return page(legible(headline.lstrip("# ")), body)
+
+
+def _answer_of(table: StudyTable) -> str:
+    """Return the answer of a study in Markdown: the differences that the evaluation shows or does not show.
+
+    For a grid these are the effects of its factors, otherwise the differences from the reference. They are
+    about income and harvest if money moves, otherwise about the first metric. "" if there is nothing to
+    compare.
+    """
+    if not table.metrics or len(table.design.conditions) < 2:
+        return ""
+    metrics = compared_metrics(table, part=EVALUATION_PART)
+    subjects = {INCOME: _INCOME, COLLECTIVE_RETURN: _HARVEST}
+    if not subjects.keys() <= set(metrics):
+        subjects = {metrics[0]: title(metrics[0])}
+    beside = f"beside {escape_cell(table.design.reference)}, {pairing_text(table)}"
+    family = condition_differences(table, metrics, part=EVALUATION_PART)
+    tests = f"{family.tests} differences of their table below"
+    parts = []
+    for metric, subject in subjects.items():
+        if effect_weights(table):
+            family = effects_of(table, metric, part=EVALUATION_PART)
+            beside = "effects of each factor over all cells of the grid, paired by replica"
+            tests = f"{family.tests} effects on a metric"
+        changes = {name: change for (name,), change in family.column(metric).items()}
+        parts += [f"- {subject}:", *_verdict_lines(changes, unit(metric))]
+    what = f"In {episodes_text(table, EVALUATION_PART)}, {beside}"
+    what += f"; by Holm's method for the {tests}:" if family.tests else ":"
+    return "\n".join([what, "", *parts])
+
+
+def _verdict_lines(differences: Mapping[str, Estimate], unit_of: str) -> list[str]:
+    """Return a line for each verdict: the differences above 0, below 0, and those that are not shown.
+
+    For differences that are not shown, the line says how large they would have to be to show.
+    """
+    by_kind: dict[str, list[str]] = {kind: [] for kind in ("more", "less", _NONE, _ALONE, _UNTOLD)}
+    for name, change in differences.items():
+        text = f"{escape_cell(name)} {change:+}"
+        if change.differs:
+            kind = "more" if change.value > 0 else "less"
+        elif isnan(change.reach):
+            kind = _UNTOLD
+        elif abs(change.value) > change.reach:
+            kind = _ALONE
+        else:
+            kind = _NONE
+            size = f"{change.reach:{number_format(change.value, change.low, change.high)}} {unit_of}".rstrip()
+            text += f" (differences below {size} would not show)" if change.reach else ""
+        by_kind[kind].append(text)
+    return [f"  - {kind}: {'; '.join(texts)}" for kind, texts in by_kind.items() if texts]
 
 
 def _html(text: str) -> str:

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Final, Self
 
 from cprl.commons import maps
 from cprl.commons.game import Game
-from cprl.commons.published import Board, game as published_game
+from cprl.commons.named_games import Board, game as published_game
 from cprl.evaluation.fresh import averages_of, fresh_episodes
 from cprl.institutions import Quota
 from cprl.measuring.registry import COLLECTIVE_RETURN

@@ -8,7 +8,7 @@ from typing import Literal, TypeAlias
 from cprl.commons import maps
 from cprl.commons.game import Game
 from cprl.evaluation.fresh import typical_replica
-from cprl.evaluation.play import board_named
+from cprl.evaluation.play import game_and_run
 from cprl.institutions import Institution
 from cprl.policies.governors import Script
 from cprl.policies.scripted import ScriptedPolicy
@@ -49,7 +49,7 @@ class HostedSession(Hosting, stored=False, called="session"):
         """
         game = self.game
         if isinstance(game, str):
-            game, _ = board_named(game, "published")
+            game, _ = game_and_run(game, "published")
         rounds = self.rounds or (("the game", game),)
         games = [(name, self._game_of(name, game, rules)) for name, rules in rounds]
         if self.governor is not None and all(game.governor is None for _, game in games):
@@ -75,7 +75,7 @@ class HostedSession(Hosting, stored=False, called="session"):
         """
         runs = [load(path) for path in self.runs]
         if isinstance(self.game, str):
-            _, run = board_named(self.game, "published")
+            _, run = game_and_run(self.game, "published")
             runs = [*([run] if run is not None else []), *runs]
         for run in runs:
             if run.experiment.transforms:

@@ -46,8 +46,8 @@ def show(
 ) -> tuple["Page", tuple[Episode, ...]]:
     """Show an episode of a run's agents as an HTML page, beside the agents of other runs if any are given.
 
-    The episode is the one that `cprl.evaluation.film.film` records with the same numbers, by default a
-    typical one, see `cprl.evaluation.fresh`. The page says which one it is.
+    The episode is the one that `cprl.evaluation.film.record_episode` records with the same numbers, by
+    default a typical one, see `cprl.evaluation.fresh`. The page says which one it is.
 
     Args:
         run: the run's directory.

@@ -63,7 +63,7 @@ def condition_means(table: StudyTable, metrics: Sequence[str] = (), *, part: str
     chosen = compared_metrics(table, metrics, part=part)
     clocks = table.design.clocks
     means = estimates(table.windows(part), chosen, by="condition")
-    return means.changed(lambda key, one: one.of(key[1], clocks.get(key[0], inf)))
+    return means.changed(lambda key, estimate: estimate.bounded(key[1], clocks.get(key[0], inf)))
 
 
 def condition_differences(table: StudyTable, metrics: Sequence[str], *, part: str = TRAINING_PART) -> Family:
@@ -72,7 +72,9 @@ def condition_differences(table: StudyTable, metrics: Sequence[str], *, part: st
     reference = {"condition": table.design.reference}
     rows = table.windows(part)
     changes = differences(rows, chosen, "condition", reference, paired=table.design.is_paired)
-    return changes.changed(lambda _, one: replace(one, bounds=(-inf, inf)))  # as Student's t gives them
+    return changes.changed(
+        lambda _, estimate: replace(estimate, bounds=(-inf, inf))
+    )  # as Student's t gives them
 
 
 def values_of(rows: pa.Table, metric: str) -> dict[str, dict[int, float]]:
@@ -90,6 +92,9 @@ def compared_metrics(
 
     The default is all of `COMPARED_METRICS` and of the user's own metrics that the table has, without those
     that only repeat another one, see `duplicate_metrics`.
+
+    Raises:
+        ValueError: for a metric that the table does not have.
     """
     for metric in metrics:
         if metric not in table.metrics:
@@ -125,11 +130,11 @@ def duplicate_metrics(table: StudyTable, part: str) -> dict[str, str]:
 
 
 def _are_equal(rows: pa.Table, metric: str, other: str) -> bool:
-    one, two = (where(rows, metric=name) for name in (metric, other))
+    first, second = (where(rows, metric=name) for name in (metric, other))
     places = ["condition", "replica", "episode"]
-    if not one.select(places).equals(two.select(places)):
+    if not first.select(places).equals(second.select(places)):
         return False
-    return are_equal(one["value"].to_numpy(), two["value"].to_numpy())
+    return are_equal(first["value"].to_numpy(), second["value"].to_numpy())
 
 
 def episodes_text(table: StudyTable, part: str = TRAINING_PART, *, metric: str | None = None) -> str:
@@ -185,7 +190,7 @@ def condition_table(
         elif name != reference:
             rows.append([name, str(replicas), *(difference_cell(number, replicas) for number in numbers)])
     what = "means over replicas"
-    note = CUT_NOTE if any(one.is_cut for one in family.values()) else ""
+    note = CUT_NOTE if any(estimate.is_cut for estimate in family.values()) else ""
     if not is_levels:
         what = f"differences from {reference}, {pairing_text(table)}"
         note = family.note("of this table")

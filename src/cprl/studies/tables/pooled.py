@@ -12,7 +12,7 @@ from cprl.runs.played import absence
 from cprl.runs.recipe import read_recipe, runs_in
 from cprl.runs.states import SESSION, state_of
 from cprl.studies.factors import ALL, normalised, values_at
-from cprl.studies.study import NOT_IN_CHECKSUM, Condition, condition_name, short_names, unique_name
+from cprl.studies.study import NOT_IN_CHECKSUM, Condition, condition_name, unique_name
 from cprl.studies.tables.sources import RunSource, clocks_of, plain_level, reason_missing, table_of_sources
 from cprl.studies.tables.tidy_table import StudyDesign, StudyTable, abbreviated
 from cprl.system.defaults import WINDOW_EPISODES
@@ -44,6 +44,10 @@ def pooled_table(
         runs: directories of runs, or of directories that hold them; results that `cprl export` made too.
         by: paths of fields of an experiment, see `cprl.studies.factors`, e.g. "game.rules.freeze_steps"; a
             path with `*` stands for all values there, "name" for what the run's recipe is called.
+
+    Raises:
+        ValueError: for a field that is no part of a condition, a seed twice in a condition, or an unknown
+            reference.
     """
     fields = [normalised(path) for path in by]
     for path in fields:
@@ -96,15 +100,14 @@ def _groups(
         values = [_value_at(experiment, path, run) for path in fields]
         key = json.dumps([to_config(value, path) for value, path in zip(values, fields, strict=True)])
         by_values.setdefault(key, (values, {}))[1][run] = experiment
-    short = short_names(fields)
     conditions: dict[str, Any] = {}
     groups: dict[str, Any] = {}
     for values, members in sorted(by_values.values(), key=lambda group: list(map(_rank, group[0]))):
         levels = {path: plain_level(value) for path, value in zip(fields, values, strict=True)}
         if _AGENTS in levels:
-            one: Any = next(iter(members.values()))
-            levels[_AGENTS] = learned(specs_by_agent(one.agents, one.game.agents))
-        name = unique_name(condition_name({short[path]: level for path, level in levels.items()}), groups)
+            first: Any = next(iter(members.values()))
+            levels[_AGENTS] = learned(specs_by_agent(first.agents, first.game.agents))
+        name = unique_name(condition_name(levels), groups)
         conditions[name] = levels
         groups[name] = members
     return conditions, groups
@@ -124,15 +127,15 @@ def _rank(value: Any) -> tuple[int, float]:
 
 def _refuse_seeds_twice(name: str, experiments: Experiments) -> None:
     """Refuse runs of one condition with the same seed, which would count replicas twice."""
-    for (one, first), (other, second) in combinations(experiments.items(), 2):
-        if first.seed == second.seed and not has_people(first.agents):
-            places = _places(first, second)
+    for (run, experiment), (other_run, other) in combinations(experiments.items(), 2):
+        if experiment.seed == other.seed and not has_people(experiment.agents):
+            places = _differing_fields(experiment, other)
             why = "they are the same experiment"
             if places:
                 why = f"they differ in {abbreviated(places, _MOST_NAMED)}"
             raise ValueError(
-                f"{one} and {other} have the same seed, {first.seed}, and both {name}, which would count "
-                f"replicas twice; {why}; allowed: each seed once in a condition, or another field in by"
+                f"{run} and {other_run} have the same seed, {experiment.seed}, and both {name}, which would "
+                f"count replicas twice; {why}; allowed: each seed once in a condition, or another field in by"
             )
 
 
@@ -159,10 +162,10 @@ def _notes(groups: Mapping[str, Experiments], fields: Sequence[str]) -> Iterator
     for name, members in groups.items():
         first, *others = members.values()
         firsts.append(first)
-        places = sorted({place for other in others for place in _places(first, other)})
+        places = sorted({place for other in others for place in _differing_fields(first, other)})
         if places:
             yield f"The runs pooled as {name} also differ in {abbreviated(places, _MOST_NAMED)}."
-    more = {place for other in firsts[1:] for place in _places(firsts[0], other)}
+    more = {place for other in firsts[1:] for place in _differing_fields(firsts[0], other)}
     places = sorted(place for place in more if not _is_within(place, fields))
     if places:
         yield f"The conditions also differ in {abbreviated(places, _MOST_NAMED)}."
@@ -176,10 +179,10 @@ def _absences(experiments: Experiments) -> Iterator[str]:
             yield f"{run}: {sentence}"
 
 
-def _places(one: Experiment, other: Experiment) -> list[str]:
+def _differing_fields(first: Experiment, second: Experiment) -> list[str]:
     """Return the paths in which two experiments differ, without fields that are part of no condition."""
-    before = one.to_config()
-    now = other.to_config()
+    before = first.to_config()
+    now = second.to_config()
     for name in _NOT_COMPARED:
         before[name] = now[name]
     lines = describe_changes(before, now, "")

@@ -166,7 +166,7 @@ def table_of_sources(design: StudyDesign, sources: Sequence[RunSource], *, windo
     missing = []
     read: list[RunSource] = []
     endings: dict[str, list[str]] = {}
-    steps: dict[str, list[int]] = {}
+    steps: dict[str, list[int | None]] = {}
     provenance: dict[str, Circumstances] = {}
     for source in sources:
         reason = source.reason
@@ -185,7 +185,7 @@ def table_of_sources(design: StudyDesign, sources: Sequence[RunSource], *, windo
         read.append(source)
         rows += [_windows(table, source, part, window) for part, table in tables.items()]
         endings.setdefault(source.condition, []).extend(outcomes)
-        steps.setdefault(source.condition, []).extend(_steps_of(source.run))
+        steps.setdefault(source.condition, []).append(_steps_of(source.run))
     study_rows = _rows(design, pa.concat_tables(rows), differing_circumstances(provenance))
     return StudyTable(
         design=design,
@@ -200,13 +200,14 @@ def table_of_sources(design: StudyDesign, sources: Sequence[RunSource], *, windo
     )
 
 
-def _lengths(rows: pa.Table, steps: Mapping[str, list[int]]) -> dict[str, dict[str, tuple[int, int]]]:
+def _lengths(rows: pa.Table, steps: Mapping[str, list[int | None]]) -> dict[str, dict[str, tuple[int, int]]]:
     """Return the smallest and the largest number of episodes and steps of a replica, by condition."""
     if not len(rows):
         return {}
     played = by_replica(where(rows, part=TRAINING_PART), rows["metric"][0].as_py(), ["condition"])
     lengths = {}
-    for name, counts in steps.items():
+    for name, stated in steps.items():
+        counts = [count for count in stated if count is not None]
         if counts:
             episodes = where(played, condition=name)["episodes"]
             least, most = pc.min_max(episodes).as_py().values()
@@ -245,7 +246,7 @@ def _refuse_gaps(table: pa.Table, source: RunSource, part: str) -> None:
         expected = max(counts.values(), default=0)
     missing = [replica for replica in replicas if replica not in counts]
     if expected is None and missing:
-        steps = [*_steps_of(source.run), "its"][0]
+        steps = _steps_of(source.run) or "its"
         raise TooShortError(f"replica {missing[0]} ended no episode in {steps} steps; train longer")
     # Where steps are counted, each replica ends a number of its own.
     is_whole = set(counts.values()) == {expected} or expected is None
@@ -256,13 +257,13 @@ def _refuse_gaps(table: pa.Table, source: RunSource, part: str) -> None:
         )
 
 
-def _steps_of(run: Path) -> list[int]:
-    """Return [steps], the trained steps that a run's report states; [] if it does not state them."""
+def _steps_of(run: Path) -> int | None:
+    """Return the trained steps that a run's report states; None if it does not state them."""
     try:
         steps = read_json(run / REPORT).get("steps")
     except (OSError, ValueError):  # which ends no table
-        return []
-    return [steps] if isinstance(steps, int) else []
+        return None
+    return steps if isinstance(steps, int) else None
 
 
 def _outcome_words(tables: Mapping[str, pa.Table]) -> list[str]:
@@ -286,19 +287,19 @@ def _windows(table: pa.Table, source: RunSource, part: str, window: int) -> pa.T
     Worlds that have finished fewer episodes are missing in the first windows. Any other part is a single
     window, unless the window is 1.
     """
-    one = where(table, agent=0)
-    replica = one["replica"].to_numpy()
-    size = window if part == TRAINING_PART or window == 1 else len(one)
-    world = world_of(one)
-    places = [_places(world[replica == number], size) for number in np.unique(replica)]
-    place = np.concatenate(places)
+    rows = where(table, agent=0)
+    replica = rows["replica"].to_numpy()
+    size = window if part == TRAINING_PART or window == 1 else len(rows)
+    world = world_of(rows)
+    windows = [_window_indices(world[replica == number], size) for number in np.unique(replica)]
+    place = np.concatenate(windows)
     group = replica * (place.max() + 1) + place
     order = np.argsort(group, kind="stable")
     begin = np.flatnonzero(np.diff(group[order], prepend=-1))
     lengths = np.diff(np.append(begin, len(order)))
     metrics = [name for name in stored_metrics(table.schema) if name not in TOTALS]
-    numbers = {name: one[name].to_numpy() for name in metrics}
-    returns = table["return"].to_numpy().astype(np.float64).reshape(len(one), -1)
+    numbers = {name: rows[name].to_numpy() for name in metrics}
+    returns = table["return"].to_numpy().astype(np.float64).reshape(len(rows), -1)
     numbers |= {f"agent_{agent}/return": values for agent, values in enumerate(returns.T)}
     values = np.stack(list(numbers.values()))[:, order]
     defined = ~np.isnan(values)
@@ -318,7 +319,7 @@ def _windows(table: pa.Table, source: RunSource, part: str, window: int) -> pa.T
     return pa.table({field.name: pa.array(columns[field.name], field.type) for field in _SCHEMA})
 
 
-def _places(world: Int64, window: int) -> Int64:
+def _window_indices(world: Int64, window: int) -> Int64:
     """Return the index of the window of each episode of a replica, int64 [E].
 
     Args:
@@ -331,13 +332,7 @@ def _places(world: Int64, window: int) -> Int64:
     return np.asarray(after.max() - after)
 
 
-_SCHEMA: Final = pa.schema(
-    [
-        *((name, pa.string()) for name in ("condition", "checksum", "run", "part", "metric")),
-        *((name, pa.int32()) for name in ("replica", "episode", WINDOWS, "undefined")),
-        ("value", pa.float64()),
-    ]
-)
+_SCHEMA: Final = pa.schema([(name, dtype) for name, dtype in TABLE_COLUMNS.items() if name != "marks"])
 """The columns of the windows of a run."""
 
 
@@ -354,15 +349,13 @@ def _rows(design: StudyDesign, rows: pa.Table, marked: Mapping[str, str]) -> pa.
     rows = rows.filter(pc.is_valid(rows["#metric"]))
     keys = ("#condition", "replica", "#part", "#metric", "episode")
     rows = rows.sort_by([(name, "ascending") for name in keys])
-    columns = {name: rows[name] for name in TABLE_COLUMNS if name != "marks"}
-    for factor in design.factors:
-        column = f"factor {factor}" if factor in TABLE_COLUMNS else factor
-        columns[column] = _levels(design.levels(factor)).take(rows["#condition"])
     places = pc.index_in(rows["run"], pa.array(list(marked), pa.string()))
-    columns["marks"] = pa.array(list(marked.values()), pa.string()).take(places)
-    names = list(columns)
-    factors = names[len(TABLE_COLUMNS) - 1 : -1]
-    return pa.table(columns).select([*TABLE_COLUMNS[:2], *factors, *TABLE_COLUMNS[2:]])
+    marks = pa.array(list(marked.values()), pa.string()).take(places)
+    table = rows.append_column("marks", marks).select(list(TABLE_COLUMNS))
+    for position, factor in enumerate(design.factors, start=2):  # after the condition and its checksum
+        column = f"factor {factor}" if factor in TABLE_COLUMNS else factor
+        table = table.add_column(position, column, _levels(design.levels(factor)).take(rows["#condition"]))
+    return table
 
 
 def _metrics(names: Sequence[str]) -> list[str]:

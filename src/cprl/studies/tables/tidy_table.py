@@ -50,20 +50,20 @@ RANDOM_PART: Final = "random"
 RUN_PARTS: Final = {TRAINING_PART: None, EVALUATION_PART: "trained", RANDOM_PART: "random"}
 """The parts of a run: the training, the evaluation of its agents in fresh worlds, and random play in the same
 worlds; with the name of the evaluation's file."""
-TABLE_COLUMNS: Final = (
-    "condition",
-    "checksum",
-    "run",
-    "marks",
-    "replica",
-    "part",
-    "metric",
-    "episode",
-    "window_episodes",
-    "undefined",
-    "value",
-)
-"""The columns of a table without those of the factors, which follow "checksum"."""
+TABLE_COLUMNS: Final = {
+    "condition": pa.string(),
+    "checksum": pa.string(),
+    "run": pa.string(),
+    "marks": pa.string(),
+    "replica": pa.int32(),
+    "part": pa.string(),
+    "metric": pa.string(),
+    "episode": pa.int32(),
+    WINDOWS: pa.int32(),
+    "undefined": pa.int32(),
+    "value": pa.float64(),
+}
+"""The types of a table's columns without those of the factors, which follow "checksum"."""
 
 Circumstances = Mapping[str, str]
 """How a run was made: the version of each package, the checksum of each module of the user's own, the git
@@ -179,6 +179,11 @@ class StudyTable:
         return tuple(self.rows["metric"].unique().to_pylist()) if len(self.rows) else ()
 
     @cached_property
+    def finished_conditions(self) -> list[str]:
+        """Return the conditions that have a finished run. Figures leave out the others."""
+        return [name for name in self.design.conditions if self.replicas[name]]
+
+    @cached_property
     def hosted_conditions(self) -> tuple[str, ...]:
         """Return the conditions that people played, whose groups end in no phase of a training."""
         return tuple(name for name, ended in self.endings.items() if not ended)
@@ -197,6 +202,9 @@ class StudyTable:
             part: "training", "evaluation" or "random".
             last: of training the last episodes of each replica, in whole windows; in many worlds as many
                 of each, see `cprl.measuring.windows.last_of`. By default as many as the table compares.
+
+        Raises:
+            ValueError: for an unknown part, or fewer episodes than a window of the table has.
         """
         checked("part", part, Literal[tuple(RUN_PARTS)])
         rows = where(self.rows, part=part)
@@ -259,9 +267,12 @@ class StudyTable:
 
     @classmethod
     def read(cls, path: Path | str, *, last: int = LAST_EPISODES) -> "StudyTable":
-        """Read a table that `write` wrote; raise a ValueError for any other file.
+        """Read a table that `write` wrote.
 
         As a side effect, the titles and units of the user's own metrics become known to this process.
+
+        Raises:
+            ValueError: for any other file.
         """
         path = Path(path)
         try:
