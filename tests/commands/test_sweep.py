@@ -57,7 +57,7 @@ if __name__ == "__main__":
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
-    """A working directory with a recipe, and studies whose figures, which tests/studies looks at, are left out."""
+    """A working directory with a recipe; figures of studies, which tests/studies looks at, are left out."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("cprl.studies.results.draw_figures", lambda table, out: [])
     monkeypatch.setattr(sys, "path", [*sys.path])

@@ -462,7 +462,7 @@ def test_a_study_varies_worlds_and_its_table_counts_the_steps_of_replicas(tmp_pa
 
 
 @pytest.mark.integration
-def test_steps_in_which_no_episode_ends_make_a_finished_run_and_a_table_says_so(tmp_path, capsys):
+def test_steps_in_which_no_episode_ends_make_a_finished_run_and_a_table_says_so(tmp_path, capsys, curves):
     run = cprl.run(experiment(steps=30), tmp_path / "run", watch="off")
     assert "No training curve: a replica has ended no episode in 30 steps" in capsys.readouterr().out
     assert json.loads((run / "report.json").read_text())["episodes"] == [0, 0]

@@ -1,6 +1,7 @@
 """Figures: everything drawn is in the legend, which lies beside the data."""
 
 import re
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from matplotlib.text import Text
 from PIL import Image
 from published import published_experiment
 from published_figures import on_white
+from random_play import random_returns
 from results import Result
 from written_episodes import an_episode
 
@@ -30,6 +32,12 @@ from cprl.runs.curves import episode_of_turn
 from cprl.runs.episodes import table_of
 from cprl.terminal import style
 from cprl.terminal.figures import training_curve
+
+
+@pytest.fixture(autouse=True)
+def little_random_play(monkeypatch):
+    """Its mean is a line of the figures, which is not looked at."""
+    monkeypatch.setattr(reported, "random_returns", partial(random_returns, episodes=10))
 
 
 def a_run(folder, metrics):
