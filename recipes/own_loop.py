@@ -28,7 +28,7 @@ from cprl.algorithms import DQN
 from cprl.algorithms.base import q_actor
 from cprl.commands.recipe_command import exit_with_message
 from cprl.learners.lanes import Lanes
-from cprl.learners.protocol import AnyLearner
+from cprl.learners.learner import Learner
 from cprl.measuring.playing import evaluate, mean_return
 from cprl.measuring.series import Observer
 from cprl.measuring.table import labelled, where
@@ -177,7 +177,7 @@ def main(
     return run
 
 
-def learn(env: CommonsEnv, learner: AnyLearner, episodes: int, *, callbacks: Sequence[Callback]) -> None:
+def learn(env: CommonsEnv, learner: Learner, episodes: int, *, callbacks: Sequence[Callback]) -> None:
     """Act, store, learn and measure, turn by turn."""
     tracker = EpisodeTracker(1, env.game.agents)
     observer = Observer(callbacks, env)

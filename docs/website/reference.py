@@ -57,7 +57,7 @@ _MODULES: Final = {
 }
 """Modules of a package that its page shows too, beside what the package exports."""
 
-INTERNAL: Final = {"system", "recurrent_state", "pictures", "runs", "terminal", "commands", "__main__"}
+INTERNAL: Final = {"system", "pictures", "runs", "terminal", "commands", "__main__"}
 """Packages that no page shows: users reach what they hold by the names of `cprl` or by a command."""
 
 

@@ -10,6 +10,7 @@ import cprl
 from cprl import Game, Rules, maps
 from cprl.algorithms import DQNSettings, OffPolicy
 from cprl.algorithms.base import q_actor
+from cprl.objectives.td import TorchRLDistance
 from cprl.population import Learning
 from cprl.values import Range
 
@@ -22,7 +23,7 @@ class CQL(OffPolicy):
     conservative_weight: Annotated[float, Range(0, 1e6)] = 0.1
     """The weight of the conservative term. TorchRL's weight is 1, for fixed data sets; with it, agents that
     explore imitate their first random actions (`tests/algorithms/test_optimum.py`)."""
-    loss_function: str = "l2"
+    loss_function: TorchRLDistance = "l2"
     update = "stacked"  # all agents in one batch; without this line, the fastest way that works is found
 
     def make_loss(self, network):

@@ -10,6 +10,7 @@ import cprl
 from cprl import Game, Rules, maps
 from cprl.algorithms import DQNSettings, OffPolicy
 from cprl.algorithms.base import module_of, policy
+from cprl.objectives.td import TorchRLDistance
 from cprl.population import Learning
 from cprl.values import Range
 
@@ -23,7 +24,7 @@ class IQL(OffPolicy):
     """The expectile of the action values that the state value estimates, 0.5..0.999."""
     temperature: Annotated[float, Range(0, 1e6)] = 3.0
     """The inverse temperature of the advantage weights, in 1/reward (1/apples)."""
-    loss_function: str = "l2"
+    loss_function: TorchRLDistance = "l2"
     stochastic = True  # the acting network gives logits, from which actions are drawn
     update = "vmapped"  # each agent by itself, at once; without this line, the fastest way is found
 

@@ -18,7 +18,7 @@ from typing import Final
 import numpy as np
 
 from cprl.commons.maps import Map
-from cprl.commons.near import growth, harvest_rates, harvests_at_once, patches, sites_around
+from cprl.commons.near import growth_probs, harvest_rates, harvests_at_once, patches, sites_around
 from cprl.commons.rules import Rules
 from cprl.commons.yields import check_proven
 from cprl.values.array_types import Bool, Float64, Int64
@@ -61,7 +61,7 @@ def yield_bounds(board: Map, rules: Rules, *, nodes: int = NODES) -> YieldBounds
         )
     check_proven(rules)
     around = sites_around(board, rules)
-    site_row, rows = growth(rules, np.array(list(map(len, around)), np.int32))
+    site_row, rows = growth_probs(rules, np.array(list(map(len, around)), np.int32))
     probs = np.broadcast_to(rows[site_row], (len(around), rows.shape[1]))
     highest = np.maximum.accumulate(probs, 1)
     kept_rate = harvest_rates(rules, probs)

@@ -3,11 +3,10 @@
 A package imports only from those above it:
     values       frozen values: a field's annotation says its range; tables that JSON holds, and back; Custom
     system       compilation, caches, memory, output, private parts of libraries
-    keys         the TensorDict entries, their shapes and types
-    recurrent_state  the states of recurrent networks from turn to turn: written, carried, read
+    keys         the TensorDict entries, their shapes and types; recurrent states from turn to turn
     institutions  rules that people make: boundaries, quotas, taxes, sanctions, votes; numpy alone
     commons      the game: maps, rules, turns; numpy and numba alone
-    pictures     games for people: boards as images and SVG, rules in words, the colours of all pictures
+    pictures     games for people: boards as images, rules in words, the colours of all pictures
     envs         TorchRL, PettingZoo, Gymnasium; make_env, where environments are put together
     networks     from observations to numbers
     objectives   what agents want, and losses that TorchRL lacks: log-cosh, MADDPG, PR2, LOLA

@@ -20,7 +20,7 @@ from random_games import (
 from cprl import Observation, RandomEnd, River, Rules, maps, presets
 from cprl.commons.batch import Batch
 from cprl.commons.literature import LITERATURE_GAMES
-from cprl.commons.near import growth
+from cprl.commons.near import growth_probs
 from cprl.institutions import Punishment
 from cprl.values import from_config, to_config
 
@@ -181,7 +181,7 @@ def test_growth_counts_the_stock_after_the_bites():
 )
 def test_growth_by_count_and_by_share(by, rows):
     rules = Rules(regrow_prob=(0.0, 0.2, 0.6), regrow_by=by)
-    of_site, probs = growth(rules, np.array([1, 2, 1]))
+    of_site, probs = growth_probs(rules, np.array([1, 2, 1]))
     assert np.allclose(probs, rows)
     assert of_site.tolist() == ([0] if by == "count" else [0, 1, 0])
 

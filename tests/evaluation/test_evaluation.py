@@ -624,7 +624,7 @@ TRAINED_IN = Fresh(seed=3)
             ),
             r"the replicas are \[1\]",
         ),
-        (lambda _: play_population("meadow", RANDOM), "where is 'meadow'"),
+        (lambda _: play_population("meadow", RANDOM), "game_or_run is 'meadow'"),
         (lambda _: play_population(MEADOW, [DQN, *RANDOM[1:]]), r"agents\[0\] is a Learning"),
         (lambda _: play_population(MEADOW, RANDOM[1:]), "1 agents are specified for a game of 2"),
         (lambda _: Fresh(replicas=(-1,)), "replicas"),

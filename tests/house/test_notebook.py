@@ -1,11 +1,15 @@
 """Games, boards and experiments draw themselves; the notebook of `examples` runs from the first cell on."""
 
+from base64 import b64decode
 from dataclasses import replace
+from io import BytesIO
 from xml.etree import ElementTree
 
 import nbformat
+import numpy as np
 import pytest
 from nbclient import NotebookClient
+from PIL import Image
 from places import ROOT
 
 import cprl
@@ -19,22 +23,21 @@ from cprl.population import Learning, Scripted
 NOTEBOOK = ROOT / "examples" / "notebook.ipynb"
 
 
-def squares(svg):
-    """How many squares of each colour a picture has."""
-    fills = [one.get("fill") for one in ElementTree.fromstring(svg).iter() if one.tag.endswith("rect")]
-    return {fill: fills.count(fill) for fill in fills}
-
-
-def hexed(colour):
-    return "#" + bytes(colour).hex()
+def cells_of(html, board, colour):
+    """In how many cells of a picture of a board a colour is."""
+    png = b64decode(ElementTree.fromstring(html.replace(">", "/>")).get("src").partition(",")[2])
+    picture = np.asarray(Image.open(BytesIO(png)))[1:, 1:]
+    cells = picture.reshape(board.height, len(picture) // board.height, board.width, -1, 3)
+    return (cells == colour).all(-1).any((1, 3)).sum()
 
 
 def test_a_board_draws_its_apples_and_agents():
-    drawn = squares(maps.parse("A>A\n.#A\n^.A")._repr_html_())
-    assert drawn[hexed(PALETTE[APPLE])] == 4
-    assert drawn[hexed(agent_colour(0))] == drawn[hexed(agent_colour(1))] == 1
+    board = maps.parse("A>A\n.#A\n^.A")
+    html = board._repr_html_()
+    assert cells_of(html, board, PALETTE[APPLE]) == 4
+    assert [cells_of(html, board, agent_colour(agent)) for agent in (0, 1)] == [1, 1]
     cleanup = presets.game("ssd/cleanup-v1").map
-    assert squares(cleanup._repr_html_())[hexed(PALETTE[WASTE])] == len(cleanup.waste)
+    assert cells_of(cleanup._repr_html_(), cleanup, PALETTE[WASTE]) == len(cleanup.waste)
 
 
 def test_a_game_and_an_experiment_say_what_they_are():
@@ -52,7 +55,7 @@ def test_a_game_and_an_experiment_say_what_they_are():
     assert "Code of its own: transforms: laws:RichPay; metrics: fair:gap." in with_own
     soft = replace(learning, algorithm=cprl.Custom("soft_q:SoftQ"))
     assert "by soft_q:SoftQ" in replace(experiment, agents=(soft,) * 4)._repr_html_()
-    for part in ("<b>a&lt;b</b>: 2 agents by DQN", "2 replicas of 4 worlds", "quota (share 0.25", "<svg"):
+    for part in ("<b>a&lt;b</b>: 2 agents by DQN", "2 replicas of 4 worlds", "quota (share 0.25", "<img"):
         assert part in html
 
 

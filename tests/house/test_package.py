@@ -21,7 +21,7 @@ from torchrl.envs import StepCounter, TransformedEnv
 import cprl
 from cprl import presets
 from cprl.commands import main as cli
-from cprl.commons.rules import GROUPS
+from cprl.commons.rules import GROUP_ARRAYS
 from cprl.envs import CommonsGymnasiumEnv, parallel_env
 from cprl.envs.make_env import make_env
 from cprl.system import waiting_room
@@ -242,7 +242,7 @@ def test_a_package_says_which_modules_it_has():
     for path in SOURCE.rglob("__init__.py"):
         words = set(re.findall(r"\w+", ast.get_docstring(ast.parse(path.read_text())) or ""))
         modules = {module.stem for module in path.parent.glob("[a-z]*.py")}
-        groups = {module.__name__.rpartition(".")[2] for module in GROUPS.values()}
+        groups = {kind.__module__.rpartition(".")[2] for kind in GROUP_ARRAYS.values()}
         assert modules - words - groups == set(), path.parent.name
 
 

@@ -154,7 +154,9 @@ def test_a_public_name_has_one_home_with_few_exceptions():
             homes[name].add(str(path.relative_to(SOURCE)))
     several = {name: sorted(modules) for name, modules in homes.items() if len(modules) > 1}
     assert len(several) <= SEVERAL_HOMES_AT_MOST, several
-    assert set(homes["Arrays"]) > {"institutions/quotas.py", "institutions/taxes.py"}, "the names are read"
+    assert set(homes["parameters"]) > {"institutions/quotas.py", "institutions/taxes.py"}, (
+        "the names are read"
+    )
 
 
 def test_a_module_has_a_name_of_its_own_with_few_exceptions():

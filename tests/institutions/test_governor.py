@@ -52,7 +52,7 @@ def test_each_world_has_a_number_of_its_own():
 
 def test_a_quota_whose_window_opens_with_the_turn_has_the_new_share():
     play = Play(ROW, institutions=[Quota(window_steps=2), SHARE], regrow_prob=(0.5,))
-    unit = play.batch.law.quotas.unit[0]
+    unit = play.batch.law.quotas.window_yield[0]
     assert play.batch.law.quotas.allowed[0, 0] == 0
     ruled(play, 2).turn("stay")
     assert play.batch.law.quotas.allowed[0, 0] == unit

@@ -1,5 +1,6 @@
 """How institutions are put together: every rule of theirs is called, and none takes another's name."""
 
+import sys
 from types import FunctionType
 from typing import Annotated, NamedTuple, get_args, get_type_hints
 
@@ -8,14 +9,15 @@ import pytest
 from boards import Play
 
 from cprl.commons import apples, loops, threads, world
-from cprl.commons.rules import GROUPS
+from cprl.commons.rules import GROUP_ARRAYS
 from cprl.institutions import Tax, hooks, ledger
 from cprl.institutions.arrays import IN_STATE, InState, filled
 from cprl.institutions.law import MODULES
 from cprl.system.jit.compiled import PLAIN_RULES, RULES_VARIABLE
 from cprl.values.array_types import Int32
 
-TOGETHER = (world, *GROUPS.values(), ledger, *MODULES.values(), permits)
+GROUPS = [sys.modules[kind.__module__] for kind in GROUP_ARRAYS.values()]
+TOGETHER = (world, *GROUPS, ledger, *MODULES.values(), permits)
 
 
 def reached(function, found):
@@ -37,7 +39,7 @@ def test_every_rule_of_an_institution_is_called_by_a_turn(name):
         if isinstance(rule, FunctionType) and rule.__module__ == module.__name__
     }
     idle = {rule.__name__ for rule in rules - reached(loops.run_worlds, set())}
-    by_values = {"parameters", "_warn_of_less_than_an_apple"}
+    by_values = {"parameters", "_warn_of_less_than_an_apple", "_may_use"}
     assert idle <= by_values, "call it in institutions/hooks.py, or in commons/turn.py"
 
 
@@ -68,11 +70,11 @@ def test_no_two_modules_claim_a_name_of_the_state_or_of_an_entry_shown_to_agents
 
 
 def test_an_institution_that_sells_harvests_forbids_nothing(monkeypatch):
-    sold = filled(permits.Arrays, {"price": [0.25]}, B=1, N=2)
+    sold = filled(permits.PermitArrays, {"price": [0.25]}, B=1, N=2)
 
     def note_harvest(law, i, cell, site, turn):
         hooks.note_harvest(law, i, cell, site, turn)
-        permits.sell_permits(permits.Arrays(sold.price, sold.bought[0]), law.ledger, i)
+        permits.sell_permits(permits.PermitArrays(sold.price, sold.bought[0]), law.ledger, i)
 
     monkeypatch.setenv(RULES_VARIABLE, PLAIN_RULES)
     monkeypatch.setattr(threads, "RUN_CODE", {})

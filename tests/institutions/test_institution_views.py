@@ -191,7 +191,7 @@ def test_a_mark_is_a_diamond_around_the_agent(tmp_path):
     def marking(viewer):
         return ViolationMarks(viewer.logger, env.base_env)
 
-    recorded(tmp_path, env, episodes=1, is_replay=True, callbacks=[seen, marking])
+    recorded(tmp_path, env, episodes=1, replay="run.rrd", callbacks=[seen, marking])
     _, marks = column(tmp_path / "run.rrd", "world/violators", "LineStrips2D:strips", "frame")
     for violators, diamonds in zip(seen.violators, marks, strict=False):
         middles = [np.mean(np.array(diamond)[:4], 0).tolist() for diamond in diamonds]

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from typing import get_args
 
 import pytest
 import torch
@@ -16,7 +17,7 @@ from cprl import presets
 from cprl.algorithms import DQN, MADDPG, PR2, SAC, DQNSettings
 from cprl.learners.optimizers import UpdateRule, torch_optimizer
 from cprl.objectives import LogCoshDQNLoss, log_cosh
-from cprl.objectives.td import DISTANCES, td_distance
+from cprl.objectives.td import Distance, td_distance
 from cprl.system.compat.torchrl import promise_targets
 
 # Two steps of Keras's RMSprop with rho 0.9, learning rate 0.1 and, to see where it stands, epsilon 0.5, from
@@ -61,7 +62,7 @@ def test_every_distance_is_that_of_torchrl_or_log_cosh():
     value, target = torch.tensor([1.0, 3.0]), torch.tensor([2.0, 3.0])
     # ln cosh 1 = ln 1.5430806 = 0.4337808.
     of_one = {"l1": 1.0, "l2": 1.0, "smooth_l1": 0.5, "log_cosh": 0.4337808}
-    assert set(of_one) == set(DISTANCES)
+    assert set(of_one) == set(get_args(Distance))
     for name, expected in of_one.items():
         assert td_distance(value, target, name).tolist() == pytest.approx([expected, 0.0])
 

@@ -11,10 +11,10 @@ from dqn_parts import q_table
 from matrix_games import prisoners_dilemma
 
 from cprl import CommonsEnv, Game, Observation, Rules, maps
+from cprl.algorithms import Tabular
 from cprl.envs import make_env, spaces_of
 from cprl.learners.lanes import Lanes
 from cprl.learners.settings import TabularSettings
-from cprl.learners.tabular import TabularLearner
 from cprl.measuring.playing import evaluate
 from cprl.policies.joint_policy import JointPolicy
 from cprl.policies.tabular import NEVER_MET, QTables
@@ -157,7 +157,7 @@ def test_the_model_is_the_game_and_what_is_observed_tells_the_state(known):
 
 def learned(game, settings, *, episodes, replicas=2, seed=0):
     who = Lanes(game.spaces, agents=[0], replicas=replicas, seed=seed)
-    learner = TabularLearner(who, settings)
+    learner = Tabular(settings=settings).make_learner(who)
     train(CommonsEnv(game, replicas, seed=seed), {(0,): learner}, Schedule(episodes=episodes))
     return learner
 
@@ -217,7 +217,7 @@ def test_with_regrowth_it_learns_the_values_too():
 
 
 def learner_of(game, settings):
-    learner = TabularLearner(Lanes(game.spaces, agents=[0], replicas=1), settings)
+    learner = Tabular(settings=settings).make_learner(Lanes(game.spaces, agents=[0], replicas=1))
     learner.game = game
     return learner
 
@@ -271,7 +271,7 @@ def test_the_learned_policy_plays_through_its_evaluation_actor():
 def test_the_table_of_an_agent_that_observes_floating_point_numbers_is_kept_as_a_network():
     env = make_env(prisoners_dilemma(turns=5), worlds=2)
     who = Lanes(spaces_of(env), agents=(0, 1), replicas=2)
-    learner = TabularLearner(who, TabularSettings(gamma=0.0, learning_rate=1.0))
+    learner = Tabular(settings=TabularSettings(gamma=0.0, learning_rate=1.0)).make_learner(who)
     train(env, {(0, 1): learner}, Schedule(episodes=20))
     table, network = q_table(learner, 0), learner.networks()["replica_0/agent_0"]
     seen = torch.from_numpy(table["observation"])

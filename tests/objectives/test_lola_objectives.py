@@ -368,10 +368,10 @@ def test_the_loss_has_lolas_gradient_under_backward_under_func_grad_and_vmapped(
     )
     torch.testing.assert_close([[own.grad for own in of] for of in parameters], wanted)
     functional, weights = FunctionalLoss(loss), weights_of(LOLALoss(actors))
-    slopes = torch.func.grad(lambda own: functional(own, {}, rollouts))(weights)
+    slopes = torch.func.grad(lambda own: functional(own, rollouts))(weights)
     torch.testing.assert_close(slopes["actors_params:1.module.0.module.weight"], parameters[1][0].grad)
     lanes = {name: torch.stack([value, value]) for name, value in weights.items()}
-    slopes = torch.func.vmap(torch.func.grad(lambda own: functional(own, {}, rollouts)))(lanes)
+    slopes = torch.func.vmap(torch.func.grad(lambda own: functional(own, rollouts)))(lanes)
     torch.testing.assert_close(slopes["actors_params:0.module.0.module.bias"][1], parameters[0][1].grad)
 
 

@@ -126,12 +126,13 @@ def write(ring, transitions):
 
 
 def q_table(learner, lane):
-    """The table of a lane of a `TabularLearner`, a row a state it has met: the bytes of all that it observed,
+    """The table of a lane of a tabular learner, a row a state it has met: the bytes of all that it observed,
     the window, and of each action its value and its visits."""
-    states, values, visits = learner.tables.lane_table(lane)
-    size = np.prod(learner.spaces.observation_shape) * np.dtype(learner.spaces.observation_dtype).itemsize
-    seen = np.ascontiguousarray(states[:, :size]).view(learner.spaces.observation_dtype)
-    seen = seen.reshape(len(states), *learner.spaces.observation_shape)
+    states, values, visits = learner.lane_networks.tables.lane_table(lane)
+    spaces = learner.lanes.spaces
+    size = np.prod(spaces.observation_shape) * np.dtype(spaces.observation_dtype).itemsize
+    seen = np.ascontiguousarray(states[:, :size]).view(spaces.observation_dtype)
+    seen = seen.reshape(len(states), *spaces.observation_shape)
     return {
         "state": [state.tobytes() for state in states],
         "observation": seen,

@@ -133,7 +133,7 @@ class Hosted:
         """Give all their budget back, so that one test does not spend that of the next."""
         self.hall._join_budget = Budget(10.0, 200.0)
         for seat in self.hall.seats:
-            seat.budget = Budget()
+            seat.budget = Budget(20.0, 40.0)
 
     def state(self):
         """All that must not change: the stage, the worlds, the seats, and every byte of the files."""

@@ -22,7 +22,7 @@ class Permits(Institution, stored=False):
     entries: ClassVar[tuple[str, ...]] = ("permits bought",)
 
 
-class Arrays(NamedTuple):
+class PermitArrays(NamedTuple):
     """All permits of a game, one per index of axis P."""
 
     price: Annotated[Float64, "P"]
@@ -30,7 +30,7 @@ class Arrays(NamedTuple):
     """Permits bought in this episode."""
 
 
-def sell_permits(permits: Arrays, ledger: Ledger, i: int) -> None:
+def sell_permits(permits: PermitArrays, ledger: Ledger, i: int) -> None:
     """Let agent i pay for a harvest."""
     for p in range(permits.price.shape[0]):
         permits.bought[p, i] += 1

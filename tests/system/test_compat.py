@@ -258,7 +258,7 @@ def test_a_loss_computes_with_whatever_weights_are_put_in_now(kind):
     wanted = [total(loss(batch.clone()), loss) for loss in losses]
     function, weights = FunctionalLoss(function), [weights_of(loss) for loss in losses]
     for turn in (0, 1, 0):  # torchrl.forget_cached_weights
-        torch.testing.assert_close(function(weights[turn], {}, batch.clone()), wanted[turn])
+        torch.testing.assert_close(function(weights[turn], batch.clone()), wanted[turn])
 
 
 def test_conservative_q_learning_bootstraps_from_its_target():

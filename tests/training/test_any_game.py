@@ -297,8 +297,8 @@ def test_under_transforms_windows_show_what_the_agents_of_the_game_observe(tmp_p
         env = CommonsEnv(GAME, 1, seed=3)
         norm = ObservationNorm(0.0, 255.0, in_keys=[("agents", "observation")], standard_normal=True)
         played = env if name == "bare" else TransformedEnv(env, norm)
-        path = tmp_path / f"{name}.rrd"
-        with ViewerCallback(tmp_path, played, title="run", episodes=9, file_name=path.name) as viewer:
+        path = tmp_path / name / "run.rrd"
+        with ViewerCallback(path.parent, played, title="run", episodes=9) as viewer:
             play(played, at_random(), 30, callbacks=[viewer])
         shown[name] = {
             entity: column(path, entity, "SegmentationImage:buffer") for entity in ("windows", "world/board")

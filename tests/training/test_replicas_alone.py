@@ -16,8 +16,9 @@ from cprl import CommonsEnv, keys
 from cprl.algorithms import DQN
 from cprl.commons.spaces import Spaces
 from cprl.experimental.current_policy import FirstReplica
+from cprl.learners.lanes import Lanes
 from cprl.learners.settings import DQNSettings
-from cprl.learners.transitions import lane_turn, transitions_of
+from cprl.learners.transitions import transitions_of
 from cprl.policies.actors import LaneActor, RandomActor
 from cprl.policies.joint_policy import JointPolicy
 from cprl.runs.episodes import EpisodeTable, read_episodes
@@ -84,8 +85,9 @@ def test_the_lean_collector_yields_what_torchrls_own_yields(worlds):
 
 def test_the_transitions_of_an_agent_are_its_own_under_torchrls_default_keys():
     for turn in CommonsEnv(GAME, 2).rollout(12, break_when_any_done=False).unbind(1):
-        lanes = lane_turn((1,), keys.Turn.of(turn), turn["next", "agents", "reward"][..., 0].numpy())
-        own = transitions_of(lanes._asdict())
+        lanes = Lanes(GAME.spaces, agents=(1,), replicas=2)
+        rewards = turn["next", "agents", "reward"][..., 0].numpy()
+        own = transitions_of(lanes.turn(keys.Turn.of(turn), rewards, lanes.form())._asdict())
         assert own.batch_size == (2,)
         assert torch.equal(own["observation"], turn[keys.OBSERVATION][:, 1])
         assert torch.equal(own["action"], turn[keys.ACTION][:, 1])
@@ -100,7 +102,9 @@ def test_transitions_of_lanes_are_those_of_the_agents():
     turn = CommonsEnv(GAME, 3).rollout(1)[:, 0]
     before, after = turn["agents"], turn["next", "agents"]
     for agents in ((0, 1), (1,), (1, 0)):
-        lanes = lane_turn(agents, keys.Turn.of(turn), after["reward"][..., 0].numpy())
+        learning = Lanes(GAME.spaces, agents=agents, replicas=3)
+        rewards = after["reward"][..., 0].numpy()
+        lanes = learning.turn(keys.Turn.of(turn), rewards, learning.form())
         for place, agent in enumerate(agents):
             own = lanes._make(entry if entry is None else entry[place :: len(agents)] for entry in lanes)
             assert np.array_equal(own.observation, before["observation"][:, agent])

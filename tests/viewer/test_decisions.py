@@ -42,7 +42,7 @@ def replay(run):
         def on_step(self, batch):
             taken.append(batch["agents", "action"][0].tolist())
 
-    with ViewerCallback(run, env, title="replay", episodes=1, is_replay=True) as viewer:
+    with ViewerCallback(run, env, title="replay", episodes=1, replay="run.rrd") as viewer:
         policies, logger = JointPolicy(actors), viewer.logger
         shown = Decisions(logger, logger.scene, policies, actions=GAME.actions)
         train(env, {}, Schedule(episodes=1), others=actors, callbacks=[Remembers(), viewer, shown])
@@ -70,7 +70,7 @@ def test_each_frame_shows_what_agents_choose_next_by_what_they_see(played):
     assert frames == column(path, "world/board", "SegmentationImage:buffer", "frame")[0]
     assert len(frames) == len(taken) - 1
     for pixels, actions in zip(images, taken[1:], strict=True):
-        image = np.array(pixels[0], np.uint8)
+        image = np.array(pixels[0], np.uint8).view(np.uint16)
         for agent in (0, 1):
             assert bars(image, agent)[1] == [actions[agent]]
 
@@ -78,7 +78,7 @@ def test_each_frame_shows_what_agents_choose_next_by_what_they_see(played):
 def test_bars_are_values_of_the_moment_or_probabilities(played):
     path, _, _ = played
     _, images = column(path, "decisions", "SegmentationImage:buffer", "frame")
-    image = np.array(images[0][0], np.uint8)
+    image = np.array(images[0][0], np.uint8).view(np.uint16)
     by_value, greedy = bars(image, 0)
     assert greedy == [1]
     assert by_value.argmax() == 1

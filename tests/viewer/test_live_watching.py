@@ -438,7 +438,7 @@ def test_who_opens_the_page_late_reads_that_history_loads_until_it_has(tmp_path,
     get = build_opener(ProxyHandler({})).open
     with RerunLogger("run", tmp_path, curves=SCENE, live="serve") as logger:
         logger.log_frames(frames(3)[0])
-        logger.log_document("header", "#### Finished")
+        logger.log_header("#### Finished")
         logger.flush()
         live = logger.live.stream
 
@@ -495,7 +495,7 @@ def test_without_a_display_or_on_request_a_run_is_served_until_it_is_interrupted
         logger.log_frames(frames(3)[0])
         for episode, text in enumerate(("# Episode 1", "# Finished")):
             logger.set_time(step=episode, episode=episode)
-            logger.log_document("header", text)
+            logger.log_header(text)
     (tmp_path / "film.rrd").write_bytes(b"half a recording")
     monkeypatch.setattr(page, "has_display", lambda: serve)
     got, said = tmp_path / "got", []

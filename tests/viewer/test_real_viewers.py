@@ -214,7 +214,7 @@ def test_the_web_viewer_shows_a_recording_that_is_served_from_its_file(tmp_path)
     """It is no replay: of a page that plays Chromium's driver gets no picture where it is drawn on a CPU."""
     with RerunLogger("run", tmp_path, curves=SCENE) as logger:
         logger.log_frames(frames(3)[0])
-        logger.log_document("header", "# Finished")
+        logger.log_header("# Finished")
     with served([tmp_path / "run.rrd"]) as page, browser(page.addresses["browser"]) as take_picture:
         look_until(
             lambda picture: len(spots(picture, BOARD, PALETTE[APPLE], within=4)) > 500,

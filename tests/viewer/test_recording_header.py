@@ -1,6 +1,7 @@
 """What people read first in a recording, and its pictures: header, label, phases, recipe and layout; the
 boards of all replicas, where agents go, the stock over the turn, and the Lorenz curve."""
 
+import math
 import time
 from dataclasses import replace
 from threading import Event
@@ -203,7 +204,7 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
 
     (tmp_path / "recipe.json").write_text("{}")
     env, common = CommonsEnv(GAME, 2), {"title": "run", "episodes": 70}
-    with ViewerCallback(tmp_path, env, file_name="whole.rrd", **common) as whole:
+    with ViewerCallback(tmp_path / "whole", env, **common) as whole:
         play(range(70), observing(whole))
     with ViewerCallback(tmp_path, env, **common) as first:
         observer = observing(first)
@@ -223,7 +224,7 @@ def test_a_resumed_recording_goes_on_as_if_it_had_not_been_stopped_and_viewers_g
         seen_by_viewers(second.logger, tmp_path / "seen", "social/collective_return", list(range(70)))
     files = [tmp_path / name for name in ("run.rrd", "run-2.rrd")]
     assert len({RrdReader(file).recordings()[0].recording_id for file in files}) == 1
-    complete, resumed = tmp_path / "whole.rrd", files[1]
+    complete, resumed = tmp_path / "whole" / "run.rrd", files[1]
     assert headers(resumed)[1][1].startswith("#### Episode 49 of 70 · falling · ")
     assert headers(resumed)[-20:] == headers(complete)[-20:]
     for name in ("social/collective_return", "agent_0/return"):
@@ -373,11 +374,11 @@ def test_a_recording_of_a_matrix_game_has_the_sum_of_returns_and_shares_of_joint
 @pytest.mark.integration
 def test_the_file_closes_while_the_live_view_goes_on(tmp_path):
     with RerunLogger("run", tmp_path, curves=SCENE, live="serve") as logger:
-        logger.log_document("header", "# one")
+        logger.log_header("# one")
         logger.close_file()
         RrdReader(tmp_path / "run.rrd").store()
         assert logger.is_live
-        logger.log_document("header", "# two")
+        logger.log_header("# two")
         logger.flush()
     assert not logger.is_live
     assert column(tmp_path / "run.rrd", "header", "TextDocument:text")[1] == [["# one"]]
@@ -389,7 +390,8 @@ def test_the_header_says_where_a_run_is_and_which_institutions_are_in_force():
     rules = rules_of(replace(GAME, institutions=institutions))
     eight = Curves(agents=("a", "b"), replicas=8)
     header = Header(curves=eight, episodes=4800, rules=rules)
-    assert header.begins("compiling") == f"#### Episode 1 of 4,800 · compiling · {rules}\n\n{eight.legend}"
+    begins = header.line(episode=1, label="compiling", mean=math.nan, random_play=None, died=None)
+    assert begins == f"#### Episode 1 of 4,800 · compiling · {rules}\n\n{eight.legend}"
     alone = Header(curves=Curves(agents=("a", "b"), metrics=()), episodes=200)
     for died in (None, 0):
         line = alone.line(episode=1, label="steady", mean=4.25, random_play=None, died=died)
@@ -434,6 +436,7 @@ def trained(folder, *, game=SMALL, replicas=2, episodes=6):
 
 def test_before_the_first_point_viewers_see_random_play_and_read_when_curves_begin():
     sent = []
+    titles = []
 
     def log_columns(name, at, columns, *, live_only=False):
         assert live_only, "the file has them with the first point"
@@ -442,18 +445,23 @@ def test_before_the_first_point_viewers_see_random_play_and_read_when_curves_beg
         }
         sent.append((name, at[1], values))
 
+    def log_row(name, texts, *, live_only=False):
+        assert live_only
+        titles.append((name, texts.labels.as_arrow_array().to_pylist()))
+
     env = CommonsEnv(GAME, 16)
     curves = scene_of(env, plotted_numbers(env, GAME.agent_names, ["harvest"], episodes=300, worlds=16))
-    logger = SimpleNamespace(curves=curves, log_columns=log_columns, log_static=lambda *parts: None)
+    logger = SimpleNamespace(
+        curves=curves, log_columns=log_columns, log_row=log_row, log_static=lambda *parts: None
+    )
     Plots(logger).random_play([fake(0, 0, returned=280.0, tagged=0)])
     lines = {name: (at, values["Scalars:scalars"]) for name, at, values in sent}
     assert lines["random_play/collective_return"] == ([0, 1], [[280.0], [280.0]]), "a line needs two points"
     for every, first in ((15, 16), (20, 32)):
-        sent.clear()
+        titles.clear()
         Pictures(logger, Samples(env, logger), every=every)
-        said = [(name, values["Points2D:labels"]) for name, _, values in sent]
-        words = [[f"lines from episode {first} on"]]
-        assert said == [("turn/title", words), ("lorenz/title", words)]
+        words = [f"lines from episode {first} on"]
+        assert titles == [("turn/title", words), ("lorenz/title", words)]
 
 
 def view_of(viewer, kind):

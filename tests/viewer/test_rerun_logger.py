@@ -108,7 +108,7 @@ def test_what_is_logged_together_is_sent_together(tmp_path):
         logger.log_scalar("alone", 1.0)
         assert not stream.buffer
         logger.log_lines("first", [1.0])
-        logger.log_document("header", "# Episode 1")
+        logger.log_header("# Episode 1")
         assert list(stream.buffer) == ["first", "header"]
         logger.send_due()
         assert not stream.buffer

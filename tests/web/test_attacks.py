@@ -13,8 +13,8 @@ from hosted import small_game
 from hostile import BINARY, CLOSE, HANDSHAKE, PING, PONG, TEXT, hosting, plan, status_of
 
 from cprl import institutions
-from cprl.runs.episodes import batches_in
 from cprl.runs.files import RunLockedError
+from cprl.runs.journal import batches_in
 from cprl.web import hall as hall_module, serving
 from cprl.web.hall import Budget, Hall, digest
 

@@ -23,12 +23,13 @@ from cprl.evaluation.fresh import fresh_episodes, record
 from cprl.measuring.playing import evaluate
 from cprl.policies.governors import Constant, StockRule
 from cprl.population import Frozen, Learning, Person, Scripted
-from cprl.runs.episodes import batches_in, read_episodes
+from cprl.runs import journal as journal_module
+from cprl.runs.episodes import read_episodes
 from cprl.runs.files import RunLockedError
+from cprl.runs.journal import Journal, batches_in, read_journal
 from cprl.training.agents import Population
 from cprl.web import hall as hall_module, hosted_round
 from cprl.web.hall import Hall, JoinRefusedError
-from cprl.web.hosted_round import Journal
 
 NUMBERS = pa.schema({"number": pa.int64()})
 COLUMNS = (
@@ -36,6 +37,10 @@ COLUMNS = (
     *("reward", "fired", "tagged", "stock", "decision", "rule", "violated", "fines"),
 )
 TURNS = 6
+
+
+def numbered(*numbers):
+    return pa.record_batch({"number": numbers}, NUMBERS)
 
 
 def rows(run):
@@ -221,7 +226,9 @@ def test_the_governor_of_the_run_that_is_hosted_governs_people(tmp_path, monkeyp
 
 
 def rows_so_far(played):
-    return [rule for batch in played._journals[0].batches for rule in batch["rule"].to_pylist()]
+    return [
+        rule for batch, _ in batches_in(played._journals["turns"].path) for rule in batch["rule"].to_pylist()
+    ]
 
 
 def test_a_governor_that_no_round_has_or_that_does_not_fit_is_refused():
@@ -233,19 +240,20 @@ def test_a_governor_that_no_round_has_or_that_does_not_fit_is_refused():
 
 def test_a_journal_that_ends_anywhere_keeps_its_whole_batches(tmp_path):
     path = tmp_path / "rows.arrows"
-    journal = Journal(path, NUMBERS)
+    journal = Journal(path)
     ends = []
     for number in range(3):
-        journal.add({"number": np.array([number, number])})
+        journal.add(numbered(number, number))
         ends.append(path.stat().st_size)
     journal.close()
     written = path.read_bytes()
     for size in range(0, len(written) + 1, 7):
         path.write_bytes(written[:size])
-        journal = Journal(path, NUMBERS)
         whole = sum(end <= size for end in ends)
-        assert [batch["number"][0].as_py() for batch in journal.batches] == list(range(whole))
-        journal.add({"number": np.array([7, 7])})
+        assert [batch["number"][0].as_py() for batch, _ in batches_in(path)] == list(range(whole))
+        journal = Journal(path)
+        assert journal.rows == 2 * whole
+        journal.add(numbered(7, 7))
         journal.close()
         assert len([*batches_in(path)]) == whole + 1
 
@@ -261,18 +269,17 @@ def test_a_full_disk_gets_no_part_of_a_batch(tmp_path, monkeypatch):
                 raise OSError(ENOSPC, "No space left on device")
             return count
 
-    monkeypatch.setattr(hosted_round, "FileIO", Disk)
-    journal = Journal(tmp_path / "turns.arrows", NUMBERS)
-    journal.add({"number": [1]})
+    monkeypatch.setattr(journal_module, "FileIO", Disk)
+    path = tmp_path / "turns.arrows"
+    journal = Journal(path)
+    journal.add(numbered(1))
     Disk.free = 20
     with pytest.raises(OSError, match="space"):
-        journal.add({"number": [2]})
+        journal.add(numbered(2))
     Disk.free = 10_000
-    journal.add({"number": [3]})
+    journal.add(numbered(3))
     journal.close()
-    again = Journal(tmp_path / "turns.arrows", NUMBERS)
-    assert again.table()["number"].to_pylist() == [1, 3]
-    again.close()
+    assert read_journal(path, NUMBERS)["number"].to_pylist() == [1, 3]
 
 
 def test_a_turn_is_in_the_journal_before_anybody_sees_it(tmp_path, monkeypatch):

@@ -14,7 +14,8 @@ from aiohttp import web
 from hosted import hosted, session
 from places import ROOT
 
-from cprl.runs.episodes import batches_in, read_episodes
+from cprl.runs.episodes import read_episodes
+from cprl.runs.journal import batches_in
 from cprl.web import serving
 from cprl.web.host import routes_of
 

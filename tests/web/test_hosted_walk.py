@@ -7,7 +7,7 @@ import pyarrow.parquet as pq
 import pytest
 from hosted_process import hosted_process, person
 
-from cprl.runs.episodes import batches_in
+from cprl.runs.journal import batches_in
 
 DESK = (1280, 800)
 PHONE = (400, 780)

@@ -8,6 +8,7 @@ and `make_loss`; docs/algorithms.md has an example.
 from collections.abc import Callable, Sequence
 from copy import deepcopy
 from dataclasses import dataclass, replace
+from inspect import getattr_static
 from typing import Annotated, Any, ClassVar
 
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule
@@ -22,7 +23,6 @@ from cprl.learners.learner import Learner, Memory, TrainingEngine as TrainingEng
 from cprl.learners.networks import COMPILED_STEPS, LaneNetworks, Update
 from cprl.learners.optimizers import UpdateRule
 from cprl.learners.plain import PlainNetworks, PlainReplay, PlainRollouts
-from cprl.learners.protocol import AnyLearner
 from cprl.learners.refusals import check_loss, refuse_other_networks
 from cprl.learners.replay import Replay
 from cprl.learners.rollouts import Rollouts
@@ -34,9 +34,8 @@ from cprl.networks.recurrent import Recurrent, state_cells_of, state_shape_of
 from cprl.networks.specification import Network, new_network
 from cprl.networks.team import TeamNetwork
 from cprl.objectives.rewards import Reward, reward_name
-from cprl.objectives.td import TORCHRL_DISTANCES
 from cprl.system.compat.torchrl import LaneCategorical
-from cprl.values import Custom, Range, Steps, Value, Where, checked, hints_of, refusal
+from cprl.values import Custom, Range, Steps, Value, hints_of, refusal
 
 Coefficient = Annotated[float, Range(0, 1e6)]
 """The weight of one term of a loss, 0 or more."""
@@ -50,16 +49,12 @@ class Algorithm(Value, stored=False):
     """
 
     settings: Any
-    """The hyperparameters, a `settings_kind`."""
+    """The hyperparameters."""
     network: Any
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
-    settings_kind: ClassVar[type[Any]] = object
-    """The class of `settings`."""
     stochastic: ClassVar[bool] = False
     """True if the acting network outputs the logits of a policy, from which actions are sampled; else it
     outputs action values, and actions are epsilon-greedy."""
-    loss_functions: ClassVar[tuple[str, ...]] = TORCHRL_DISTANCES
-    """The values that the field `loss_function` may have, in algorithms that have this field."""
     shares_reward: ClassVar[bool] = False
     """True if the members of a team must learn from the team reward; else each can have its own."""
     can_share_parameters: ClassVar[bool] = False
@@ -76,11 +71,6 @@ class Algorithm(Value, stored=False):
     def __post_init__(self) -> None:
         super().__post_init__()
         name = type(self).__name__
-        functions = self.loss_functions
-        checked(f"{name}.settings", self.settings, self.settings_kind)
-        if hasattr(self, "loss_function"):
-            allowed = Where(lambda function: function in functions, ", ".join(map(repr, functions)))
-            checked(f"{name}.loss_function", self.loss_function, Annotated[str, allowed])
         self._refuse_unread(getattr(self, "loss", None))
         network = getattr(self, "network", None)
         if isinstance(network, Recurrent) and not self.can_be_recurrent:
@@ -165,21 +155,16 @@ class Algorithm(Value, stored=False):
         """Return the class whose `update` holds for this algorithm, see `declared_update`."""
         if isinstance(self.network, Custom) or getattr(self, "loss", None) is not None:
             return None
-        classes = type(self).__mro__
-        index = next(index for index, algorithm in enumerate(classes) if "update" in vars(algorithm))
-        declaring_class: Any = classes[index]
+        kind = type(self)
+        declaring_class: Any = next(base for base in kind.__mro__ if "update" in vars(base))
         if declaring_class.update is None:
             return None
-        overridden = {
-            name
-            for algorithm in classes[:index]
-            for name in vars(algorithm)
-            if hasattr(declaring_class, name)
-        }
-        overridden -= {*hints_of(declaring_class), "_called"}  # fields may have other defaults
-        overrides_methods = any(not name.startswith("__") for name in overridden)
-        has_other_bases = classes[index:] != declaring_class.__mro__
-        return None if overrides_methods or has_other_bases else declaring_class
+        names = {name for name in dir(declaring_class) if not name.startswith("__")}
+        names -= {*hints_of(declaring_class), "_called"}  # fields may have other defaults
+        for name in names:
+            if getattr_static(kind, name) is not getattr_static(declaring_class, name):
+                return None
+        return declaring_class
 
     def custom_loss(self, loss: Custom, network: nn.Module) -> LossModule:
         """Return a loss of the user's over the networks of `make_network`.
@@ -240,10 +225,10 @@ class Algorithm(Value, stored=False):
             update=update,
             target_networks=targets,
             sharing=lanes.sharing,
-            compile=engine == "compiled" and memory.sequence_steps <= COMPILED_STEPS,
+            compile=engine == "compiled" and memory.form.sequence_steps <= COMPILED_STEPS,
         )
 
-    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> AnyLearner:
+    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> Learner:
         """Return the learner of some agents in every replica.
 
         Raises:
@@ -271,7 +256,6 @@ class OffPolicy(Algorithm, stored=False):
     settings: DQNSettings
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
-    settings_kind: ClassVar[type[Any]] = DQNSettings
     can_share_parameters: ClassVar[bool] = True
     sees_peers_actions: ClassVar[bool] = False
     """True if the loss reads the actions of all N agents of the game: "action" is [.., N] in place of [..],
@@ -335,7 +319,6 @@ class OnPolicy(Algorithm, stored=False):
     settings: RolloutSettings
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
-    settings_kind: ClassVar[type[Any]] = RolloutSettings
     stochastic: ClassVar[bool] = True
     can_share_parameters: ClassVar[bool] = True
 
@@ -387,11 +370,13 @@ class TeamAlgorithm(Algorithm, stored=False):
     shares_reward: ClassVar[bool] = True
     fewest_members: ClassVar[int] = 1
     """The smallest team that the algorithm supports."""
+    is_one_lane: ClassVar[bool] = True
+    """True if a team is one lane; else each member is a lane of its own."""
 
-    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> AnyLearner:
+    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> Learner:
         self.refuse_torchrl(engine)
         self.check_team(len(lanes.agents), lanes.reward)
-        return Learner(self, replace(lanes, are_teams=True), engine)
+        return Learner(self, replace(lanes, are_teams=self.is_one_lane), engine)
 
     def check_team(self, members: int, reward: Reward) -> None:
         """Raise a ValueError if the algorithm supports no team of this size, or not its reward."""

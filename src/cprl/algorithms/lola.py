@@ -10,9 +10,7 @@ from torchrl.objectives import LossModule
 from cprl.algorithms.base import Coefficient, TeamAlgorithm, TrainingEngine, policy
 from cprl.commons.spaces import Spaces
 from cprl.learners.lanes import Lanes
-from cprl.learners.learner import Learner
 from cprl.learners.lola import LOLANetworks, LOLARollouts
-from cprl.learners.protocol import AnyLearner
 from cprl.learners.settings import LOLASettings
 from cprl.networks.specification import Network
 from cprl.objectives import LOLADiCELoss, LOLALoss
@@ -55,10 +53,10 @@ class LOLA(TeamAlgorithm):
     """The weight of the policies' entropy in the loss."""
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
-    settings_kind = LOLASettings
     stochastic = True
     shares_reward = False
     fewest_members = 2
+    is_one_lane = False
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         return self.new_networks(spaces, actor=spaces.actions, critic=1)
@@ -78,8 +76,3 @@ class LOLA(TeamAlgorithm):
         self, networks: Sequence[nn.Module], targets: Any, lanes: Lanes, memory: Any, engine: TrainingEngine
     ) -> Any:
         return LOLANetworks(networks, self.make_loss, self.settings, members=len(lanes.agents))
-
-    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> AnyLearner:
-        self.refuse_torchrl(engine)
-        self.check_team(len(lanes.agents), lanes.reward)
-        return Learner(self, lanes, engine)  # members are lanes of their own

@@ -15,7 +15,7 @@ from cprl.networks.mlp import MLP, MLPNetwork
 from cprl.networks.specification import Network
 from cprl.networks.team import JointCritics, TeamNetwork
 from cprl.objectives.maddpg import NOISE_NUMBERS, MADDPGLoss
-from cprl.objectives.td import DISTANCES
+from cprl.objectives.td import Distance
 from cprl.values import Custom
 
 
@@ -46,7 +46,7 @@ class MADDPG(TeamAlgorithm, OffPolicy):
 
     logit_penalty: Coefficient = 1e-3
     """The weight of the mean squared logit in the actors' loss, 0..1e6; 1e-3 in the published program."""
-    loss_function: str = "l2"
+    loss_function: Distance = "l2"
     """The loss of the critics' temporal-difference errors, see `DQN.loss_function`."""
     network: Network | Custom | None = None
     """The architecture of the networks, see `DQN.network`. Critics of fully connected layers read the
@@ -57,7 +57,6 @@ class MADDPG(TeamAlgorithm, OffPolicy):
     fewest_members = 2
     stochastic = True
     noise_numbers = NOISE_NUMBERS
-    loss_functions = DISTANCES
     update = "stacked"
 
     def make_network(self, spaces: Spaces) -> nn.Module:

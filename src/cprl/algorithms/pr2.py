@@ -10,7 +10,7 @@ from cprl.algorithms.base import OffPolicy
 from cprl.commons.spaces import Spaces
 from cprl.networks.agent import JointNetwork, MethodModule
 from cprl.objectives.pr2 import PR2Loss
-from cprl.objectives.td import DISTANCES
+from cprl.objectives.td import Distance
 from cprl.values import Range
 
 Temperature = Annotated[float, Range(1e-6, 1e6)]
@@ -42,11 +42,10 @@ class PR2(OffPolicy):
     entropy_bonus: bool = True
     """True if values contain the entropy of the joint action, as in the paper, which pays agents for every
     step that they live; see `PR2Loss`."""
-    loss_function: str = "l2"
+    loss_function: Distance = "l2"
     """The loss of the temporal-difference error, see `DQN.loss_function`."""
     stochastic = True
     sees_peers_actions = True
-    loss_functions = DISTANCES
     update = "stacked"
 
     def make_network(self, spaces: Spaces) -> nn.Module:

@@ -9,6 +9,7 @@ from torchrl.objectives import DiscreteSACLoss, LossModule
 from cprl.algorithms.base import OffPolicy, module_of, policy
 from cprl.commons.spaces import Spaces
 from cprl.networks.agent import AgentNetworks
+from cprl.objectives.td import TorchRLDistance
 from cprl.values import Range, Share
 
 
@@ -24,7 +25,7 @@ class SAC(OffPolicy):
     """The target entropy of the temperature, as a fraction of the maximum entropy log A, 0..1."""
     alpha_init: Annotated[float, Range(1e-12, 1e6)] = 0.1
     """The initial temperature, in units of reward (apples)."""
-    loss_function: str = "l2"
+    loss_function: TorchRLDistance = "l2"
     stochastic = True
     update = "vmapped"
 

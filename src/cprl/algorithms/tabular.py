@@ -1,28 +1,38 @@
 """Tabular Q-learning, algorithm 1 of the study."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from cprl.algorithms.base import Algorithm, TrainingEngine
 from cprl.commons.spaces import Spaces
 from cprl.learners.lanes import Lanes
-from cprl.learners.protocol import AnyLearner
+from cprl.learners.learner import Learner
 from cprl.learners.settings import TabularSettings
-from cprl.learners.tabular import TabularLearner, table_network
+from cprl.learners.tabular import TabularMemory, TabularNetworks, table_network
 from cprl.policies.tabular import TableNetwork
 
 
 @dataclass(frozen=True, kw_only=True)
 class Tabular(Algorithm):
-    """Tabular Q-learning; see `TabularLearner`."""
+    """Tabular Q-learning; see `cprl.learners.tabular`.
+
+    Tables are neither compiled nor on a GPU.
+    """
 
     settings: TabularSettings
-    settings_kind = TabularSettings
 
     def make_network(self, spaces: Spaces) -> TableNetwork:
         return table_network(spaces)
 
-    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> AnyLearner:
-        # Tables are neither compiled nor on a GPU.
+    def make_memory(self, lanes: Lanes, network: Any, engine: TrainingEngine) -> Any:
+        return TabularMemory(lanes, self.settings)
+
+    def make_lane_networks(
+        self, networks: Sequence[Any], targets: Any, lanes: Lanes, memory: Any, engine: TrainingEngine
+    ) -> Any:
+        return TabularNetworks(networks, memory, self.settings)
+
+    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> Learner:
         self.refuse_torchrl(engine)
-        self.make_network(lanes.spaces)
-        return TabularLearner(lanes, self.settings)
+        return super().make_learner(lanes, engine)

@@ -20,10 +20,9 @@ from cprl.commands.flags import (
     VariantFlag,
 )
 from cprl.commands.play_stored import FreshFlags, begin_playing, paths_of, runs_by_name, show_played
-from cprl.commands.recipe_command import Words
 from cprl.commands.studies import (
     StudyOptions,
-    TrialOptions,
+    VariedOptions,
     carry_out,
     executor_of,
     read_recipe_and_options,
@@ -198,11 +197,9 @@ def exploit(
 
 
 @dataclass(frozen=True, kw_only=True)
-class SearchOptions(TrialOptions):
+class SearchOptions(VariedOptions):
     """What is searched, and how it is run."""
 
-    vary: Words = ()
-    """PATH=VALUE,VALUE,... or PATH=loguniform(LOW,HIGH); may be repeated."""
     points: int = 30
     """The number of points that Optuna (extra "optuna") proposes."""
     metric: str = "collective_return"

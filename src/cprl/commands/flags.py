@@ -115,12 +115,17 @@ class TableFiles:
     csv: bool = False
     """Print every row as CSV, and nothing else."""
 
-    def check(self) -> None:
-        """Refuse files that cannot be written, before hours of work."""
+    def check(self, **beside: object) -> None:
+        """Refuse files that cannot be written, before hours of work.
+
+        Args:
+            beside: other settings of the command that --csv leaves no room for; none is true by default.
+        """
         from cprl.runs.files import refuse_to_write_over
         from cprl.terminal.text_tables import WRITERS
 
-        others = [name for name, value in vars(self).items() if value and name not in ("csv", "figure_width")]
+        given = {**vars(self), **beside}
+        others = [name for name, value in given.items() if value and name not in ("csv", "figure_width")]
         if self.csv and others:
             cure = others[0] + ", as --out FILE.csv writes means and intervals" * (others[0] == "out")
             raise ValueError(f"--csv prints every row and nothing else; allowed: without --{cure}")
@@ -162,8 +167,8 @@ class ResultFiles(TableFiles):
     """The width of the figure: a page, or a column of a paper, 3.3 inches, with its caption in a file beside
     it."""
 
-    def check(self) -> None:
-        super().check()
+    def check(self, **beside: object) -> None:
+        super().check(**beside)
         if self.figure is not None:
             from cprl.terminal.style import check_picture
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, Protocol, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TypeVar
 
 import tyro
 
@@ -78,6 +78,14 @@ class TrialOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class VariedOptions(TrialOptions):
+    """Options that say what is varied, and how trials are run."""
+
+    vary: Words = ()
+    """PATH=VALUE,VALUE,... e.g. game.rules.freeze-steps=5,25,100; repeated, every combination is run."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class StudyOptions(TrialOptions):
     """Options of how a study is run."""
 
@@ -102,11 +110,9 @@ class MainOptions(StudyOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SweepOptions(StudyOptions):
+class SweepOptions(StudyOptions, VariedOptions):
     """Options of `cprl sweep`: what is varied, and how it is run."""
 
-    vary: Words = ()
-    """PATH=VALUE,VALUE,... e.g. game.rules.freeze-steps=5,25,100; repeated, every combination is run."""
     draws: int | None = None
     """The number of random combinations that are run instead of all combinations."""
     design: Literal["random", "latin_hypercube", "sobol"] = "random"
@@ -118,14 +124,7 @@ class SweepOptions(StudyOptions):
 ResultT = TypeVar("ResultT")
 
 
-class _VariedOptions(Protocol):
-    """Options that say what is varied: PATH=VALUES each."""
-
-    @property
-    def vary(self) -> tuple[str, ...]: ...
-
-
-VariedOptionsT = TypeVar("VariedOptionsT", bound=_VariedOptions)
+VariedOptionsT = TypeVar("VariedOptionsT", bound=VariedOptions)
 
 
 def study_main(study: "Study", argv: Sequence[str] | None = None) -> Path:
@@ -168,7 +167,7 @@ def study_fields(options: TrialOptions) -> dict[str, Any]:
 
     These are the fields that the class of the options defines itself; inherited ones say how trials are run.
     """
-    names = {"block", *type(options).__annotations__} - {"vary"}
+    names = {"block", *type(options).__annotations__}
     return {name: value for name, value in vars(options).items() if name in names and value is not None}
 
 
@@ -218,7 +217,7 @@ def read_recipe_and_options(
     return experiment, options
 
 
-def _print_help(options: _VariedOptions, program: str, about: str) -> None:
+def _print_help(options: VariedOptions, program: str, about: str) -> None:
     """Print the help of a command that varies a recipe, and end the process."""
     kind: Any = type(options)
 
@@ -245,6 +244,9 @@ def recipe_of(source: Path) -> "Callable[..., Experiment]":
     Args:
         source: a Python file with a function `experiment`, which is imported; a recipe.json; or the directory
             of a run.
+
+    Raises:
+        ValueError: for anything else.
     """
     if source.suffix != ".py" or source.is_dir():
         directory = source if source.is_dir() else source.parent
@@ -295,7 +297,11 @@ _CONFIG: Final = (tyro.conf.HelptextFromCommentsOff,)
 
 
 def executor_of(options: TrialOptions) -> "Executor":
-    """Return the executor for the options --on, --jobs and --address."""
+    """Return the executor for the options --on, --jobs and --address.
+
+    Raises:
+        ValueError: for options that do not go together.
+    """
     from cprl.studies.executors import InProcess, Jobs, Processes
 
     jobs = 1 if options.jobs is None else checked("--jobs", options.jobs, Jobs)

@@ -1,7 +1,7 @@
 """`cprl table`: compare any runs, or the runs of a study."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import tyro
 
-from cprl.commands.flags import ROWS, TableFiles, TableFlags
+from cprl.commands.flags import TableFiles, TableFlags
 from cprl.runs.recipe import read_recipe, runs_in
 from cprl.system.defaults import LAST_EPISODES, STUDY_TABLE, WINDOW_EPISODES
 from cprl.system.output import OUT, say
@@ -68,9 +68,8 @@ def table(
         summary: Write summary.md and the figures of a study again, from its table alone.
         figures: Draw the figures of a study into its figures/ as png, pdf or svg, of the metrics asked for.
     """
-    files.check()
-    if files.csv:
-        _refuse_beside_csv({"summary": summary, "figures": figures, "reference": reference, **vars(compare)})
+    compared = {name: value for name, value in vars(compare).items() if value != getattr(Compare, name)}
+    files.check(summary=summary, figures=figures, reference=reference, **compared)
     if not runs:
         raise ValueError("cprl table needs at least one run: cprl table RUN... --by FIELD")
     if not by and not (runs[0] / STUDY_TABLE).exists() and _people_played(runs):
@@ -78,6 +77,8 @@ def table(
     for flag, value in (("--summary", summary), ("--figures", figures)):
         if value and by:
             raise ValueError(f"{flag} is of a study; allowed: without --by, cprl table STUDY {flag}")
+    from cprl.measuring.table import where
+
     if by:
         study_table = _pool_runs(runs, by, reference, window)
     else:
@@ -98,16 +99,11 @@ def table(
 
         for path in draw_figures(study_table, runs[0], suffix=f".{figures}", metrics=compare.metric):
             say(f"Figure: {path}")
-    _write_files(files.out, study_table, compare, tables)
+    rows = study_table.rows
+    if compare.metric:
+        rows = where(rows, metric=compare.metric)
+    files.write(replace(study_table, rows=rows).as_arrow(), tables, notes=str(study_table).split("\n"))
     _exit_if_damaged(study_table)
-
-
-def _refuse_beside_csv(settings: Mapping[str, object]) -> None:
-    """Refuse all settings that are not their default, since --csv prints every row and nothing else."""
-    defaults = {"summary": False, **vars(Compare())}
-    for name, value in settings.items():
-        if value != defaults.get(name):
-            raise ValueError(f"--csv prints every row and nothing else; allowed: without --{name}")
 
 
 def _people_played(runs: Sequence[Path]) -> bool:
@@ -142,24 +138,6 @@ def _print_comparison(study_table: "StudyTable", compare: Compare) -> "list[Text
     print_tables([*map(without_unfinished, compared), *effects])
     say(str(study_table))
     return [*compared, *effects]
-
-
-def _write_files(
-    paths: Sequence[Path], study_table: "StudyTable", compare: Compare, tables: "Sequence[TextTable]"
-) -> None:
-    """Write the rows of the compared metrics to each .parquet file, and the tables to all other files."""
-    from cprl.measuring.table import where
-    from cprl.terminal.text_tables import write_tables
-
-    for path in paths:
-        if path.suffix == ROWS:
-            rows = study_table.rows
-            if compare.metric:
-                rows = where(rows, metric=tuple(compare.metric))
-            replace(study_table, rows=rows).write(path)
-        else:
-            write_tables(tables, path, notes=str(study_table).split("\n"))
-        say(f"Written: {path}")
 
 
 def _exit_if_damaged(table: "StudyTable") -> None:

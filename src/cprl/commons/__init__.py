@@ -4,8 +4,7 @@ The rules of a turn are plain Python functions, each about one world. Numba comp
 GPU, where a loop calls them for each of B worlds.
 
 Letters, here and in shapes of arrays: B worlds, N agents, K sites (cells where apples grow), H x W cells of
-the board, and C channels of an observation of X rows and Y columns. In the rules, i and j are agents and k is
-a site.
+the board, and C channels of an observation of X rows and Y columns.
 
 Modules in reading order. How a game is described:
 

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from cprl.institutions import Law
 
 
-def act(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch: Scratch) -> None:
+def apply_actions(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch: Scratch) -> None:
     """Apply each agent's action to its position, heading and beam; `actions`: int64 [N].
 
     Under the clash rule "in_turn" agents act one after another, in an order drawn by chance, and a clashing
@@ -37,34 +37,36 @@ def act(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch:
     if tables.clashes == IN_TURN:
         draw_order(world, scratch)
     for turn_place in range(world.row.shape[0]):
-        i = scratch.order[turn_place] if tables.clashes == IN_TURN else turn_place
-        act_one(world, tables, law, actions, scratch, i)
-        if world.fired[i] or is_cleaning(world.groups.river, i):
-            note_shot(world, i)
-        if tables.clashes == IN_TURN and world.in_play[i] and has_company(world, i):
-            go_back(world, scratch, i)
+        agent = scratch.order[turn_place] if tables.clashes == IN_TURN else turn_place
+        apply_action(world, tables, law, actions, scratch, agent)
+        if world.fired[agent] or is_cleaning(world.groups.river, agent):
+            note_shot(world, agent)
+        if tables.clashes == IN_TURN and world.in_play[agent] and has_company(world, agent):
+            go_back(world, scratch, agent)
 
 
-def act_one(world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch: Scratch, i: int) -> None:
-    """Apply the action of agent i if it is in play, and note where it begins the turn."""
-    scratch.start_row[i] = world.row[i]
-    scratch.start_col[i] = world.col[i]
-    world.fired[i] = False
-    action = without_signal(actions[i], world.groups.signals)
-    send_signal(world, world.groups.signals, i, actions[i])
-    aim_to_clean(world.groups.river, i, world.in_play[i], action)
-    if not world.in_play[i]:
+def apply_action(
+    world: Worlds, tables: Tables, law: Law | None, actions: Int64, scratch: Scratch, agent: int
+) -> None:
+    """Apply the action of an agent if it is in play, and note where it begins the turn."""
+    scratch.start_row[agent] = world.row[agent]
+    scratch.start_col[agent] = world.col[agent]
+    world.fired[agent] = False
+    action = without_signal(actions[agent], world.groups.signals)
+    send_signal(world, world.groups.signals, agent, actions[agent])
+    aim_to_clean(world.groups.river, agent, world.in_play[agent], action)
+    if not world.in_play[agent]:
         return
-    in_cooldown = tables.cooldown_steps > 0 and world.cooldown[i] > 0
+    in_cooldown = tables.cooldown_steps > 0 and world.cooldown[agent] > 0
     if in_cooldown:
-        world.cooldown[i] -= 1
+        world.cooldown[agent] -= 1
     if action < TURN_LEFT:  # actions 0 to 3 walk, in the order of `WALK_TURN`
-        walk(world, tables, i, (world.heading[i] + WALK_TURN[action]) % 4)
+        walk(world, tables, agent, (world.heading[agent] + WALK_TURN[action]) % 4)
     elif action == TURN_LEFT:
-        world.heading[i] = (world.heading[i] + 3) % 4  # three turns to the right
+        world.heading[agent] = (world.heading[agent] + 3) % 4  # three turns to the right
     elif action == TURN_RIGHT:
-        world.heading[i] = (world.heading[i] + 1) % 4
+        world.heading[agent] = (world.heading[agent] + 1) % 4
     elif action == FIRE and tables.has_beam and not in_cooldown:
-        world.fired[i] = law is None or law.sanctioner.may_fire[i]
+        world.fired[agent] = law is None or law.sanctioner.may_fire[agent]
         if tables.cooldown_steps > 0:
-            world.cooldown[i] = tables.cooldown_steps
+            world.cooldown[agent] = tables.cooldown_steps

@@ -19,8 +19,8 @@ from cprl.commons.chance import (
 )
 from cprl.commons.moves import cell_of
 from cprl.commons.quirks import keep_old_stock
-from cprl.commons.river import pollute, slowed
-from cprl.commons.signals import Arrays as Signals, without_signal
+from cprl.commons.river import pollute, reduced_threshold
+from cprl.commons.signals import SignalArrays, without_signal
 from cprl.institutions.hooks import note_apple, note_harvest, note_step, stops_harvest
 from cprl.values.array_types import Float32, Int64
 
@@ -36,9 +36,9 @@ FROM_START, BEFORE_BITES, AFTER_BITES = range(3)
 def fill(world: Worlds, tables: Tables) -> None:
     """Begin an episode with an apple on every site, or on `first_stock` sites drawn by chance."""
     sites = world.stock.shape[0]
-    for k in range(sites):
-        world.stock[k] = 1
-        world.near[k] = tables.near_first[k + 1] - tables.near_first[k]
+    for site in range(sites):
+        world.stock[site] = 1
+        world.near[site] = tables.near_first[site + 1] - tables.near_first[site]
     world.stock_left[0] = sites
     if tables.first_stock < sites:
         draw_first_stock(world, tables)
@@ -53,42 +53,42 @@ def draw_first_stock(world: Worlds, tables: Tables) -> None:
     """
     missing = tables.first_stock
     sites = world.stock.shape[0]
-    for k in range(sites):
-        word = np.int64(draw(world, FIRST_STOCK | k)[0])
-        has_apple = word * (sites - k) < missing << WORD_SIZE
-        world.stock[k] = has_apple
+    for site in range(sites):
+        word = np.int64(draw(world, FIRST_STOCK | site)[0])
+        has_apple = word * (sites - site) < missing << WORD_SIZE
+        world.stock[site] = has_apple
         missing -= has_apple
     recount(world, tables)
 
 
-def add_apple(world: Worlds, tables: Tables, law: Law | None, k: int) -> None:
-    """Put an apple on site k, and update every count of apples."""
-    world.stock[k] = 1
+def add_apple(world: Worlds, tables: Tables, law: Law | None, site: int) -> None:
+    """Put an apple on a site, and update every count of apples."""
+    world.stock[site] = 1
     world.stock_left[0] += 1
-    for n in range(tables.near_first[k], tables.near_first[k + 1]):
-        world.near[tables.near_sites[n]] += 1
+    for pair in range(tables.near_first[site], tables.near_first[site + 1]):
+        world.near[tables.near_sites[pair]] += 1
     if law is not None:
-        note_apple(law, k, 1)
+        note_apple(law, site, 1)
 
 
-def remove_apple(world: Worlds, tables: Tables, law: Law | None, k: int) -> None:
-    """Take the apple from site k, and update every count of apples."""
-    world.stock[k] = 0
+def remove_apple(world: Worlds, tables: Tables, law: Law | None, site: int) -> None:
+    """Take the apple from a site, and update every count of apples."""
+    world.stock[site] = 0
     world.stock_left[0] -= 1
-    for n in range(tables.near_first[k], tables.near_first[k + 1]):
-        world.near[tables.near_sites[n]] -= 1
+    for pair in range(tables.near_first[site], tables.near_first[site + 1]):
+        world.near[tables.near_sites[pair]] -= 1
     if law is not None:
-        note_apple(law, k, -1)
+        note_apple(law, site, -1)
 
 
 def recount(world: Worlds, tables: Tables) -> None:
     """Count the apples on the board, and the apples near each site, from the stock alone."""
     world.stock_left[0] = 0
-    for k in range(world.stock.shape[0]):
-        world.near[k] = 0
-        world.stock_left[0] += world.stock[k]
-        for n in range(tables.near_first[k], tables.near_first[k + 1]):
-            world.near[k] += world.stock[tables.near_sites[n]]
+    for site in range(world.stock.shape[0]):
+        world.near[site] = 0
+        world.stock_left[0] += world.stock[site]
+        for pair in range(tables.near_first[site], tables.near_first[site + 1]):
+            world.near[site] += world.stock[tables.near_sites[pair]]
 
 
 def draw_first_bytes(world: Worlds, scratch: Scratch) -> None:
@@ -115,16 +115,18 @@ def find_sprouts(world: Worlds, tables: Tables, scratch: Scratch) -> int:
     if tables.regrow_by_share:
         open_sites = find_open_by_share(world, tables, scratch)
     else:
-        for k in range(world.stock.shape[0]):
-            first_byte = (scratch.words[k >> 2] >> (8 * (k & 3))) & LOW_BYTE
-            scratch.sprouts[open_sites] = k
-            open_sites += (world.stock[k] == 0) & (first_byte <= tables.regrow_first_byte[world.near[k]])
+        for site in range(world.stock.shape[0]):
+            first_byte = (scratch.words[site >> 2] >> (8 * (site & 3))) & LOW_BYTE
+            scratch.sprouts[open_sites] = site
+            open_sites += (world.stock[site] == 0) & (
+                first_byte <= tables.regrow_first_byte[world.near[site]]
+            )
     sprouts = 0
-    for n in range(open_sites):
-        k = scratch.sprouts[n]
-        is_free = tables.regrow_under_agents or not is_stood_on(world, tables, k)
-        if is_free and has_sprouted(world, tables, scratch, k):
-            scratch.sprouts[sprouts] = k
+    for candidate in range(open_sites):
+        site = scratch.sprouts[candidate]
+        is_free = tables.regrow_under_agents or not is_stood_on(world, tables, site)
+        if is_free and has_sprouted(world, tables, scratch, site):
+            scratch.sprouts[sprouts] = site
             sprouts += 1
     return sprouts
 
@@ -132,35 +134,38 @@ def find_sprouts(world: Worlds, tables: Tables, scratch: Scratch) -> int:
 def find_open_by_share(world: Worlds, tables: Tables, scratch: Scratch) -> int:
     """Find the sites that may grow an apple by their first byte, where each site has its own thresholds."""
     open_sites = 0
-    for k in range(world.stock.shape[0]):
-        first_byte = (scratch.words[k >> 2] >> (8 * (k & 3))) & LOW_BYTE
-        row = tables.regrow_row[k] + world.near[k]
-        scratch.sprouts[open_sites] = k
-        open_sites += (world.stock[k] == 0) & (first_byte <= tables.regrow_first_byte[row])
+    for site in range(world.stock.shape[0]):
+        first_byte = (scratch.words[site >> 2] >> (8 * (site & 3))) & LOW_BYTE
+        row = tables.regrow_row[site] + world.near[site]
+        scratch.sprouts[open_sites] = site
+        open_sites += (world.stock[site] == 0) & (first_byte <= tables.regrow_first_byte[row])
     return open_sites
 
 
-def has_sprouted(world: Worlds, tables: Tables, scratch: Scratch, k: int) -> bool:
-    """Return whether site k grows an apple: its whole random word is below its threshold."""
-    first_byte = (scratch.words[k >> 2] >> (8 * (k & 3))) & LOW_BYTE
-    rest = np.int64(draw(world, REGROWTH_REST + k)[0]) >> BYTE_BITS
-    row = tables.regrow_row[k] if tables.regrow_by_share else 0
-    threshold = slowed(tables.regrow_below[row + world.near[k]], world.groups.river)
+def has_sprouted(world: Worlds, tables: Tables, scratch: Scratch, site: int) -> bool:
+    """Return whether a site grows an apple: its whole random word is below its threshold."""
+    first_byte = (scratch.words[site >> 2] >> (8 * (site & 3))) & LOW_BYTE
+    rest = np.int64(draw(world, REGROWTH_REST + site)[0]) >> BYTE_BITS
+    row = tables.regrow_row[site] if tables.regrow_by_share else 0
+    threshold = reduced_threshold(tables.regrow_below[row + world.near[site]], world.groups.river)
     return ((first_byte << REST_BITS) | rest) < threshold
 
 
-def is_stood_on(world: Worlds, tables: Tables, k: int) -> bool:
-    """Return whether an agent in play stands on site k."""
-    for i in range(world.row.shape[0]):
-        if world.in_play[i] and tables.site_at[cell_of(world.row[i], world.col[i], tables)] == k:
+def is_stood_on(world: Worlds, tables: Tables, site: int) -> bool:
+    """Return whether an agent in play stands on a site."""
+    for agent in range(world.row.shape[0]):
+        if (
+            world.in_play[agent]
+            and tables.site_at[cell_of(world.row[agent], world.col[agent], tables)] == site
+        ):
             return True
     return False
 
 
 def grow(world: Worlds, tables: Tables, law: Law | None, scratch: Scratch, sprouts: int) -> None:
     """Put an apple on each site that `find_sprouts` found; `sprouts`: the number of these sites."""
-    for s in range(sprouts):
-        add_apple(world, tables, law, scratch.sprouts[s])
+    for sprout in range(sprouts):
+        add_apple(world, tables, law, scratch.sprouts[sprout])
 
 
 def harvest_and_grow(
@@ -190,33 +195,33 @@ def harvest_apples(world: Worlds, tables: Tables, law: Law | None, actions: Int6
     harvest, or note the rule that it breaks. Two agents share a cell only where clashes are settled
     "pairwise": then the agent with the lower index comes first.
     """
-    for i in range(world.row.shape[0]):
-        harvest[i] = 0.0
-        if world.in_play[i]:
-            cell = cell_of(world.row[i], world.col[i], tables)
+    for agent in range(world.row.shape[0]):
+        harvest[agent] = 0.0
+        if world.in_play[agent]:
+            cell = cell_of(world.row[agent], world.col[agent], tables)
             if law is not None:
-                note_step(law, i, cell)
-            k = tables.site_at[cell]
+                note_step(law, agent, cell)
+            site = tables.site_at[cell]
             if (
-                k >= 0
-                and world.stock[k] == 1
-                and harvests(tables, world.groups.signals, actions[i])
-                and may_be_harvested(law, i, cell, k, world.step[0])
+                site >= 0
+                and world.stock[site] == 1
+                and harvests(tables, world.groups.signals, actions[agent])
+                and may_be_harvested(law, agent, cell, site, world.step[0])
             ):
-                remove_apple(world, tables, law, k)
-                harvest[i] = 1.0
-                world.harvested[i] += 1
+                remove_apple(world, tables, law, site)
+                harvest[agent] = 1.0
+                world.harvested[agent] += 1
                 if law is not None:
-                    note_harvest(law, i, cell, k, world.step[0])
+                    note_harvest(law, agent, cell, site, world.step[0])
 
 
-def harvests(tables: Tables, signals: Signals | None, action: int) -> bool:
+def harvests(tables: Tables, signals: SignalArrays | None, action: int) -> bool:
     """Return whether an action harvests the apple on which the agent stands."""
     return tables.harvest_number < 0 or tables.harvest_number == without_signal(action, signals)
 
 
-def may_be_harvested(law: Law | None, i: int, cell: int, k: int, step: int) -> bool:
-    """Return whether institutions let agent i harvest site k, which lies on a cell."""
+def may_be_harvested(law: Law | None, agent: int, cell: int, site: int, step: int) -> bool:
+    """Return whether institutions let an agent harvest a site, which lies on a cell."""
     if law is None:
         return True
-    return not stops_harvest(law, i, cell, k, step)
+    return not stops_harvest(law, agent, cell, site, step)

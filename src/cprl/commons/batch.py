@@ -137,6 +137,9 @@ class Batch:
             output: the output to write into; None for a new one.
             selected: bool [B], True for worlds that begin; None for all. In a new batch all worlds must
                 begin.
+
+        Raises:
+            ValueError: if `selected` has another form, or leaves out worlds of a new batch.
         """
         if selected is not None:
             if selected.shape != (self.size,) or selected.dtype != np.bool_:
@@ -168,7 +171,14 @@ class Batch:
         return output
 
     def put_in_force(self, rule: Int64) -> None:
-        """Put an option of the governor in force in each world from the coming turn on; `rule`: int64 [B]."""
+        """Put an option of the governor in force in each world from the coming turn on.
+
+        Args:
+            rule: int64 [B], the index of the option in each world.
+
+        Raises:
+            ValueError: for an index that no option has.
+        """
         assert self.game.governor is not None
         assert self.law is not None
         options = np.array(self.game.governor.options)
@@ -178,7 +188,7 @@ class Batch:
         in_force[:, -1] = options[rule]
         self.driver.write(self.law.ledger.in_force, in_force)
 
-    def seen(self) -> Float32:
+    def governor_features(self) -> Float32:
         """Return the features that the governor observes of each world, float32 [B, S], see
         `Governor.sees`."""
         assert self.game.governor is not None

@@ -23,14 +23,14 @@ if TYPE_CHECKING:
     from cprl.institutions import Law
 
 
-def note_shot(world: Worlds, i: int) -> None:
-    """Note the cell and heading from which agent i fires or cleans.
+def note_shot(world: Worlds, agent: int) -> None:
+    """Note the cell and heading from which an agent fires or cleans.
 
     It stays there for the rest of this turn, unless it is tagged and returns at a spawn place.
     """
-    world.shot_row[i] = world.row[i]
-    world.shot_col[i] = world.col[i]
-    world.shot_heading[i] = world.heading[i]
+    world.shot_row[agent] = world.row[agent]
+    world.shot_col[agent] = world.col[agent]
+    world.shot_heading[agent] = world.heading[agent]
 
 
 def beam_cell(world: Worlds, tables: Tables, shooter: int, ahead: int, side: int) -> int:
@@ -73,25 +73,25 @@ def beam_reach(world: Worlds, tables: Tables, shooter: int, side: int, stands: B
 
 def first_agent(world: Worlds, tables: Tables, shooter: int, side: int, reach: int, stands: Bool) -> int:
     """Return how many cells ahead the first agent in a column of the beam is, `reach` if there is none."""
-    for i in range(stands.shape[0]):
-        ahead, agent_side = place_in_beam(world, i, shooter)
-        is_in_the_way = stands[i] and not has_respawned(world, tables, i)
+    for agent in range(stands.shape[0]):
+        ahead, agent_side = place_in_beam(world, agent, shooter)
+        is_in_the_way = stands[agent] and not has_respawned(world, tables, agent)
         if is_in_the_way and agent_side == side and ahead >= beam_begin(tables, side):
             reach = min(reach, ahead)
     return reach
 
 
-def has_respawned(world: Worlds, tables: Tables, i: int) -> bool:
-    """Return whether agent i was tagged in this turn and is already back in play, at a spawn place."""
-    return tables.respawn_at_spawns and world.in_play[i] and world.tagged_step[i] == world.step[0]
+def has_respawned(world: Worlds, tables: Tables, agent: int) -> bool:
+    """Return whether an agent was tagged in this turn and is already back in play, at a spawn place."""
+    return tables.respawn_at_spawns and world.in_play[agent] and world.tagged_step[agent] == world.step[0]
 
 
-def place_in_beam(world: Worlds, i: int, shooter: int) -> tuple[int, int]:
-    """Return where agent i is as seen from a shooter: the cells ahead of it, and the cells to its right."""
+def place_in_beam(world: Worlds, agent: int, shooter: int) -> tuple[int, int]:
+    """Return where an agent is as seen from a shooter: the cells ahead of it, and the cells to its right."""
     heading = world.shot_heading[shooter]
     right = (heading + 1) % 4
-    rows_down = world.row[i] - world.shot_row[shooter]
-    cols_right = world.col[i] - world.shot_col[shooter]
+    rows_down = world.row[agent] - world.shot_row[shooter]
+    cols_right = world.col[agent] - world.shot_col[shooter]
     ahead = rows_down * ROW_STEP[heading] + cols_right * COL_STEP[heading]
     return ahead, rows_down * ROW_STEP[right] + cols_right * COL_STEP[right]
 
@@ -113,9 +113,14 @@ def find_hits(world: Worlds, tables: Tables, hit_by: Bool) -> None:
     Write `hit_by`, bool [N, N]: agent hit, shooter.
     """
     agents = world.row.shape[0]
-    for i in range(agents):
-        for j in range(agents):
-            hit_by[i, j] = world.fired[j] and i != j and world.in_play[i] and is_hit(world, tables, i, j)
+    for agent in range(agents):
+        for shooter in range(agents):
+            hit_by[agent, shooter] = (
+                world.fired[shooter]
+                and agent != shooter
+                and world.in_play[agent]
+                and is_hit(world, tables, agent, shooter)
+            )
 
 
 def tag(world: Worlds, tables: Tables, law: Law | None, hit_by: Bool, tagged_by: Bool) -> None:
@@ -124,43 +129,43 @@ def tag(world: Worlds, tables: Tables, law: Law | None, hit_by: Bool, tagged_by:
     Institutions may change the time-out, fine the agents, and refund unjust tags. `hit_by` and `tagged_by`,
     which is written, are bool [N, N]: agent hit, shooter.
     """
-    for i in range(world.row.shape[0]):
-        if count_hit(world, tables, hit_by, tagged_by, i):
+    for agent in range(world.row.shape[0]):
+        if count_hit(world, tables, hit_by, tagged_by, agent):
             freeze_steps = tables.freeze_steps
             if law is not None:
                 freeze_steps = sanction_tag(
-                    law.sanctions, law.ledger, tagged_by, i, world.step[0], freeze_steps
+                    law.sanctions, law.ledger, tagged_by, agent, world.step[0], freeze_steps
                 )
-            world.hits[i] = 0
-            world.offences[i] += 1
-            take_out(world, i, freeze_steps)
+            world.hits[agent] = 0
+            world.offences[agent] += 1
+            take_out(world, agent, freeze_steps)
     if law is not None:
         mediate(law.mediation, law.ledger, tagged_by, world.step[0])
         punish(law.punishment, law.ledger, tagged_by, world.fired)
 
 
-def count_hit(world: Worlds, tables: Tables, hit_by: Bool, tagged_by: Bool, i: int) -> bool:
-    """Count at most one hit of agent i, and return whether this hit tags it.
+def count_hit(world: Worlds, tables: Tables, hit_by: Bool, tagged_by: Bool, agent: int) -> bool:
+    """Count at most one hit of an agent, and return whether this hit tags it.
 
-    Write into `tagged_by`, bool [N, N], which agents tagged agent i.
+    Write into `tagged_by`, bool [N, N], which agents tagged this one.
     """
     is_hit_now = False
-    for j in range(world.row.shape[0]):
-        tagged_by[i, j] = False
-        if hit_by[i, j]:
+    for shooter in range(world.row.shape[0]):
+        tagged_by[agent, shooter] = False
+        if hit_by[agent, shooter]:
             is_hit_now = True
     if not is_hit_now:
         return False
-    world.hits[i] += 1
-    if world.hits[i] < tables.hits_to_tag:
+    world.hits[agent] += 1
+    if world.hits[agent] < tables.hits_to_tag:
         return False
-    for j in range(world.row.shape[0]):
-        tagged_by[i, j] = hit_by[i, j]
+    for shooter in range(world.row.shape[0]):
+        tagged_by[agent, shooter] = hit_by[agent, shooter]
     return True
 
 
-def take_out(world: Worlds, i: int, freeze_steps: int) -> None:
-    """Take agent i out of play for at least `freeze_steps` turns."""
-    world.in_play[i] = False
-    world.tagged_step[i] = world.step[0]
-    world.out_steps[i] = max(world.out_steps[i], turns_missed(freeze_steps, world.groups.quirks))
+def take_out(world: Worlds, agent: int, freeze_steps: int) -> None:
+    """Take an agent out of play for at least `freeze_steps` turns."""
+    world.in_play[agent] = False
+    world.tagged_step[agent] = world.step[0]
+    world.out_steps[agent] = max(world.out_steps[agent], turns_missed(freeze_steps, world.groups.quirks))

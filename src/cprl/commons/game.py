@@ -84,7 +84,7 @@ class Game(Value):
     @property
     def agent_names(self) -> tuple[str, ...]:
         """Return agent_0, agent_1, ..., one name for each agent."""
-        return tuple(f"agent_{i}" for i in range(self.agents))
+        return tuple(f"agent_{agent}" for agent in range(self.agents))
 
     @property
     def actions(self) -> tuple[str, ...]:

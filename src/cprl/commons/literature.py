@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from cprl.commons.game import Game
     from cprl.commons.maps import Entrances, Map
 
+# The signs of the boards are those of their programs, see `cprl.commons.maps.LEGENDS`: "melting_pot" (open,
+# closed, partnership), "ssd" (harvest), "ssd_cleanup" (cleanup).
 _OPEN_BOARD: Final = """
 WWWWWWWWWWWWWWWWWWWWWWWW
 WAAA    A      A    AAAW
@@ -138,12 +140,18 @@ _MELTING_POT_RULES: Final[dict[str, Any]] = {
     "random_end": {"prob": 0.15, "from_step": 1099, "every_steps": 100},
     "plays_on_when_empty": True,
 }
+"""The rules of closed and partnership, from `meltingpot/configs/substrates/commons_harvest__closed.py` and
+`..__partnership.py`: growth from `REGROWTH_PROBABILITIES`, the beam from `Zapper`, the window from `view`,
+the end from `StochasticIntervalEpisodeEnding` and `maxEpisodeLengthFrames`. `freeze_steps` is
+`framesTillRespawn` + 1, as turns of the original show."""
 _OPEN_RULES: Final[dict[str, Any]] = _MELTING_POT_RULES | {
     "regrow_prob": (0.0, 0.0025, 0.005, 0.025),
     "beam_length_cells": 3,
     "cooldown_steps": 2,
     "freeze_steps": 5,
 }
+"""The rules of open, from `meltingpot/configs/substrates/commons_harvest__open.py`, where
+`framesTillRespawn` is 4."""
 _SSD_RULES: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.005, 0.02, 0.05),
     "regrow_radius_cells": 1.5,
@@ -160,12 +168,16 @@ _SSD_RULES: Final[dict[str, Any]] = {
     "window_columns": 15,
     "plays_on_when_empty": True,
 }
+"""The rules of harvest, from `social_dilemmas/envs/harvest.py` and `map_env.py`: growth from `SPAWN_PROB`;
+`APPLE_RADIUS`, 2, is compared with a squared distance there, so apples are near up to its root."""
 _CLEANUP_RULES: Final[dict[str, Any]] = _SSD_RULES | {
     "regrow_prob": (0.05,),
     "regrow_radius_cells": 0,
     "first_stock_share": 0.0,
     "river": {"may_clean": True, "pollution_prob": 0.5},
 }
+"""The rules of cleanup, from `social_dilemmas/envs/cleanup.py`: `appleRespawnProbability` and
+`wasteSpawnProbability`; its thresholds are the defaults of `River`."""
 _SOCIALJAX_RULES: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.001, 0.005, 0.025),
     "regrow_under_agents": False,
@@ -181,6 +193,7 @@ _SOCIALJAX_RULES: Final[dict[str, Any]] = {
     "window_columns": 11,
     "plays_on_when_empty": True,
 }
+"""The rules of SocialJax' harvest_open."""
 _PEROLAT_RULES: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.01, 0.01, 0.05, 0.05, 0.1),
     "beam_length_cells": 10,
@@ -188,7 +201,7 @@ _PEROLAT_RULES: Final[dict[str, Any]] = {
     "window_rows": 20,
     "window_columns": 21,
 }
-# A turn is an eighth of a second, the time that a person takes for a move in the laboratory.
+"""The rules of the paper, with what it does not say at second hand, see `docs/results/details.md`."""
 _JANSSEN_RULES: Final[dict[str, Any]] = {
     "regrow_prob": (0.0, 0.01 / 8),
     "regrow_by": "share",
@@ -201,6 +214,8 @@ _JANSSEN_RULES: Final[dict[str, Any]] = {
     "beam_width_cells": 1,
     "episode_steps": 1920,
 }
+"""The rules of the paper and its supporting material. A turn is an eighth of a second, the time that a
+person takes for a move in the laboratory: growth of 0.01 per second, and episodes of 240 seconds."""
 
 
 class LiteratureGame(NamedTuple):

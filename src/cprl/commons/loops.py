@@ -38,28 +38,30 @@ class Played(NamedTuple):
 
 def run_worlds(game: Played, task: int, scratch: Scratch, first: int, last: int) -> None:
     """Do a task with the selected worlds among first .. last - 1; see `run_world` for the tasks."""
-    for b in range(first, last):
-        if game.selected[b]:
-            world = one_world(game.worlds, b)
-            output = one_output(game.output, b)
-            law = one_law(game.law, b)
-            run_world(world, game.tables, task, game.actions[b], game.decisions[b], output, law, scratch)
+    for index in range(first, last):
+        if game.selected[index]:
+            world = one_world(game.worlds, index)
+            output = one_output(game.output, index)
+            law = one_law(game.law, index)
+            run_world(
+                world, game.tables, task, game.actions[index], game.decisions[index], output, law, scratch
+            )
 
 
 def show_worlds(game: tuple[Worlds, Tables, UInt8], scratch: Scratch, first: int, last: int) -> None:
     """Draw the boards of the worlds first .. last - 1 into the last entry of `game`, uint8 [B, H, W], as
     classes of cells."""
     worlds, tables, boards = game
-    for b in range(first, last):
-        draw_board(one_world(worlds, b), tables, scratch, boards[b])
+    for index in range(first, last):
+        draw_board(one_world(worlds, index), tables, scratch, boards[index])
 
 
 def first_invalid(actions: Int64, known: int) -> int:
     """Return the index of the first action outside 0 .. known - 1, or -1 if all are known; `actions`: int64,
     one axis."""
-    for n in range(actions.shape[0]):
-        if actions[n] < 0 or actions[n] >= known:
-            return n
+    for index in range(actions.shape[0]):
+        if actions[index] < 0 or actions[index] >= known:
+            return index
     return -1
 
 

@@ -96,8 +96,8 @@ class Map(Value):
         return f"Map({self.height} x {self.width}, {len(self.sites)} sites, {self.agents} agents)"
 
     def _repr_html_(self) -> str:
-        """Return the board as SVG, for notebooks; the game knows nothing of pictures."""
-        return import_module("cprl.pictures.svg").board_svg(self)
+        """Return a picture of the board, for notebooks; the game knows nothing of pictures."""
+        return import_module("cprl.pictures.image").board_html(self)
 
     @property
     def agents(self) -> int:
@@ -330,7 +330,7 @@ def published(name: str) -> Map:
 
 
 def with_agents(board: Map, agents: int) -> Map:
-    """Return the board with starts for another number of agents.
+    """Return the board with starts for another number of agents; refuse more than fit on it.
 
     For fewer agents the first starts are kept. Further agents start at the free spawn places, in their order,
     and then on the free ground nearest to the first start, with the heading of the last start. Ground is free
@@ -475,6 +475,9 @@ def random(
         clustering: the probability with which a site is placed on a free cell next to an earlier site, and
             not on any free cell. At 0 sites are independent; near 1 they form a single patch.
         seed: the seed of the random numbers; equal arguments give equal boards.
+
+    Raises:
+        ValueError: for sizes or shares out of range, or more sites and agents than cells.
     """
     height = checked("height", height, Side)
     width = checked("width", width, Side)

@@ -37,63 +37,63 @@ def is_wall(row: int, col: int, tables: Tables) -> bool:
 
 def draw_order(world: Worlds, scratch: Scratch) -> None:
     """Draw a permutation of the agents into `scratch.order`, all equally likely, as `shuffle_starts` does."""
-    for i in range(world.row.shape[0]):
-        scratch.order[i] = i
-    for i in range(world.row.shape[0] - 1, 0, -1):
-        j = int(draw(world, ORDER | i)[0] % np.uint64(i + 1))
-        scratch.order[i], scratch.order[j] = scratch.order[j], scratch.order[i]
+    for agent in range(world.row.shape[0]):
+        scratch.order[agent] = agent
+    for last in range(world.row.shape[0] - 1, 0, -1):
+        drawn = int(draw(world, ORDER | last)[0] % np.uint64(last + 1))
+        scratch.order[last], scratch.order[drawn] = scratch.order[drawn], scratch.order[last]
 
 
-def walk(world: Worlds, tables: Tables, i: int, direction: int) -> None:
-    """Move agent i by one cell in a direction, given as a heading, unless a wall is there."""
-    row = world.row[i] + ROW_STEP[direction]
-    col = world.col[i] + COL_STEP[direction]
+def walk(world: Worlds, tables: Tables, agent: int, direction: int) -> None:
+    """Move an agent by one cell in a direction, given as a heading, unless a wall is there."""
+    row = world.row[agent] + ROW_STEP[direction]
+    col = world.col[agent] + COL_STEP[direction]
     if not is_wall(row, col, tables):
-        world.row[i] = row
-        world.col[i] = col
+        world.row[agent] = row
+        world.col[agent] = col
 
 
-def go_back(world: Worlds, scratch: Scratch, i: int) -> None:
-    """Move agent i back to the cell where it began the turn."""
-    world.row[i] = scratch.start_row[i]
-    world.col[i] = scratch.start_col[i]
+def go_back(world: Worlds, scratch: Scratch, agent: int) -> None:
+    """Move an agent back to the cell where it began the turn."""
+    world.row[agent] = scratch.start_row[agent]
+    world.col[agent] = scratch.start_col[agent]
 
 
-def has_moved(world: Worlds, scratch: Scratch, i: int) -> bool:
-    """Return whether agent i has left the cell where it began the turn."""
-    return world.row[i] != scratch.start_row[i] or world.col[i] != scratch.start_col[i]
+def has_moved(world: Worlds, scratch: Scratch, agent: int) -> bool:
+    """Return whether an agent has left the cell where it began the turn."""
+    return world.row[agent] != scratch.start_row[agent] or world.col[agent] != scratch.start_col[agent]
 
 
-def share_a_cell(world: Worlds, i: int, j: int) -> bool:
+def share_a_cell(world: Worlds, agent: int, other: int) -> bool:
     """Return whether two agents are on one cell."""
-    return world.row[i] == world.row[j] and world.col[i] == world.col[j]
+    return world.row[agent] == world.row[other] and world.col[agent] == world.col[other]
 
 
-def have_swapped(world: Worlds, scratch: Scratch, i: int, j: int) -> bool:
+def have_swapped(world: Worlds, scratch: Scratch, agent: int, other: int) -> bool:
     """Return whether each of two agents is on the cell where the other began the turn."""
     return (
-        world.row[i] == scratch.start_row[j]
-        and world.col[i] == scratch.start_col[j]
-        and world.row[j] == scratch.start_row[i]
-        and world.col[j] == scratch.start_col[i]
+        world.row[agent] == scratch.start_row[other]
+        and world.col[agent] == scratch.start_col[other]
+        and world.row[other] == scratch.start_row[agent]
+        and world.col[other] == scratch.start_col[agent]
     )
 
 
-def clash(world: Worlds, scratch: Scratch, i: int, j: int) -> bool:
+def clash(world: Worlds, scratch: Scratch, agent: int, other: int) -> bool:
     """Return whether the moves of two agents in play clash: they share a cell or have swapped."""
-    return share_a_cell(world, i, j) or have_swapped(world, scratch, i, j)
+    return share_a_cell(world, agent, other) or have_swapped(world, scratch, agent, other)
 
 
-def has_company(world: Worlds, i: int) -> bool:
-    """Return whether agent i shares its cell with another agent in play."""
-    for j in range(world.row.shape[0]):
-        if j != i and world.in_play[j] and share_a_cell(world, i, j):
+def has_company(world: Worlds, agent: int) -> bool:
+    """Return whether an agent shares its cell with another agent in play."""
+    for other in range(world.row.shape[0]):
+        if other != agent and world.in_play[other] and share_a_cell(world, agent, other):
             return True
     return False
 
 
 def settle_clashes(world: Worlds, tables: Tables, scratch: Scratch) -> None:
-    """Undo moves that clash, as `Rules.clashes` says; under "in_turn" `act` has undone them already."""
+    """Undo moves that clash, as `Rules.clashes` says; under "in_turn" `apply_actions` undid them already."""
     if tables.clashes == PAIRWISE:
         settle_pairwise(world, scratch)
     elif tables.clashes != IN_TURN:
@@ -113,54 +113,58 @@ def settle_at_once(world: Worlds, tables: Tables, scratch: Scratch) -> None:
     unsettled = True
     while unsettled:
         unsettled = False
-        for i in range(world.row.shape[0]):
-            scratch.blocked[i] = (
-                world.in_play[i]
-                and has_moved(world, scratch, i)
-                and (loses_its_cell(world, scratch, i) if one_moves else is_in_a_clash(world, scratch, i))
+        for agent in range(world.row.shape[0]):
+            scratch.blocked[agent] = (
+                world.in_play[agent]
+                and has_moved(world, scratch, agent)
+                and (
+                    loses_its_cell(world, scratch, agent)
+                    if one_moves
+                    else is_in_a_clash(world, scratch, agent)
+                )
             )
-            unsettled = unsettled or scratch.blocked[i]
-        for i in range(world.row.shape[0]):
-            if scratch.blocked[i]:
-                go_back(world, scratch, i)
+            unsettled = unsettled or scratch.blocked[agent]
+        for agent in range(world.row.shape[0]):
+            if scratch.blocked[agent]:
+                go_back(world, scratch, agent)
 
 
-def loses_its_cell(world: Worlds, scratch: Scratch, i: int) -> bool:
-    """Return whether agent i, which has moved, has to go back.
+def loses_its_cell(world: Worlds, scratch: Scratch, agent: int) -> bool:
+    """Return whether an agent, which has moved, has to go back.
 
     It has to if it swaps cells with another agent in play, if another agent stayed on its new cell, or if
     another one moved there and comes first in `scratch.order`.
     """
-    for j in range(world.row.shape[0]):
-        if j != i and world.in_play[j]:
-            is_first = not has_moved(world, scratch, j) or scratch.order[j] < scratch.order[i]
-            if have_swapped(world, scratch, i, j) or (is_first and share_a_cell(world, i, j)):
+    for other in range(world.row.shape[0]):
+        if other != agent and world.in_play[other]:
+            is_first = not has_moved(world, scratch, other) or scratch.order[other] < scratch.order[agent]
+            if have_swapped(world, scratch, agent, other) or (is_first and share_a_cell(world, agent, other)):
                 return True
     return False
 
 
-def is_in_a_clash(world: Worlds, scratch: Scratch, i: int) -> bool:
-    """Return whether agent i clashes with any agent in play."""
-    for j in range(world.row.shape[0]):
-        if j != i and world.in_play[j] and clash(world, scratch, i, j):
+def is_in_a_clash(world: Worlds, scratch: Scratch, agent: int) -> bool:
+    """Return whether an agent clashes with any agent in play."""
+    for other in range(world.row.shape[0]):
+        if other != agent and world.in_play[other] and clash(world, scratch, agent, other):
             return True
     return False
 
 
 def settle_pairwise(world: Worlds, scratch: Scratch) -> None:
     """[run] Move both agents of a clash back, pair by pair by index, even onto a third agent."""
-    for i in range(world.row.shape[0]):
-        for j in range(i + 1, world.row.shape[0]):
-            if world.in_play[i] and world.in_play[j] and clash(world, scratch, i, j):
-                go_back(world, scratch, i)
-                go_back(world, scratch, j)
+    for agent in range(world.row.shape[0]):
+        for other in range(agent + 1, world.row.shape[0]):
+            if world.in_play[agent] and world.in_play[other] and clash(world, scratch, agent, other):
+                go_back(world, scratch, agent)
+                go_back(world, scratch, other)
 
 
 def count_down(world: Worlds) -> None:
     """Count this turn as missed for every agent out of play."""
-    for i in range(world.row.shape[0]):
-        if world.out_steps[i] > 0:
-            world.out_steps[i] -= 1
+    for agent in range(world.row.shape[0]):
+        if world.out_steps[agent] > 0:
+            world.out_steps[agent] -= 1
 
 
 def return_to_play(world: Worlds, tables: Tables, scratch: Scratch) -> None:
@@ -173,61 +177,63 @@ def return_to_play(world: Worlds, tables: Tables, scratch: Scratch) -> None:
     if tables.respawn_at_spawns:
         respawn(world, tables)
         return
-    for i in range(world.row.shape[0]):
-        is_not_due = world.in_play[i] or world.out_steps[i] > 0
-        scratch.blocked[i] = is_not_due or (tables.clashes != PAIRWISE and has_to_wait(world, i))
-    for i in range(world.row.shape[0]):
-        if not scratch.blocked[i]:
-            world.in_play[i] = True
+    for agent in range(world.row.shape[0]):
+        is_not_due = world.in_play[agent] or world.out_steps[agent] > 0
+        scratch.blocked[agent] = is_not_due or (tables.clashes != PAIRWISE and has_to_wait(world, agent))
+    for agent in range(world.row.shape[0]):
+        if not scratch.blocked[agent]:
+            world.in_play[agent] = True
 
 
 def respawn(world: Worlds, tables: Tables) -> None:
     """Bring the agents that have missed all their turns back at spawn places, as long as places are free."""
-    for i in range(world.row.shape[0]):
-        if not world.in_play[i] and world.out_steps[i] == 0:
-            world.in_play[i] = draw_place(world, tables, i)
+    for agent in range(world.row.shape[0]):
+        if not world.in_play[agent] and world.out_steps[agent] == 0:
+            world.in_play[agent] = draw_place(world, tables, agent)
 
 
-def has_to_wait(world: Worlds, i: int) -> bool:
-    """Return whether agent i, out of play, has to wait: its cell is taken, or another returns first."""
-    for j in range(world.row.shape[0]):
-        if j != i and share_a_cell(world, i, j):
-            first_in_line = world.out_steps[j] == 0 and world.tagged_step[j] < world.tagged_step[i]
-            if world.in_play[j] or first_in_line:
+def has_to_wait(world: Worlds, agent: int) -> bool:
+    """Return whether an agent, out of play, has to wait: its cell is taken, or another returns first."""
+    for other in range(world.row.shape[0]):
+        if other != agent and share_a_cell(world, agent, other):
+            first_in_line = (
+                world.out_steps[other] == 0 and world.tagged_step[other] < world.tagged_step[agent]
+            )
+            if world.in_play[other] or first_in_line:
                 return True
     return False
 
 
 def place_at_starts(world: Worlds, tables: Tables) -> None:
     """Put every agent in play at its start, with the heading of the map, and clear what it did before."""
-    for i in range(world.row.shape[0]):
-        world.row[i] = tables.start[i, 0]
-        world.col[i] = tables.start[i, 1]
-        world.heading[i] = tables.start[i, 2]
-        world.out_steps[i] = 0
-        world.in_play[i] = True
-        world.on_board[i] = True
-        world.fired[i] = False
-        world.shot_row[i] = 0
-        world.shot_col[i] = 0
-        world.shot_heading[i] = 0
-        world.cooldown[i] = 0
-        world.signal[i] = 0
-        world.hits[i] = 0
-        world.tagged_step[i] = 0
-        world.offences[i] = 0
-        world.harvested[i] = 0
+    for agent in range(world.row.shape[0]):
+        world.row[agent] = tables.start[agent, 0]
+        world.col[agent] = tables.start[agent, 1]
+        world.heading[agent] = tables.start[agent, 2]
+        world.out_steps[agent] = 0
+        world.in_play[agent] = True
+        world.on_board[agent] = True
+        world.fired[agent] = False
+        world.shot_row[agent] = 0
+        world.shot_col[agent] = 0
+        world.shot_heading[agent] = 0
+        world.cooldown[agent] = 0
+        world.signal[agent] = 0
+        world.hits[agent] = 0
+        world.tagged_step[agent] = 0
+        world.offences[agent] = 0
+        world.harvested[agent] = 0
 
 
 def shuffle_starts(world: Worlds) -> None:
     """Permute the agents' starts, all permutations equally likely (Durstenfeld, "Algorithm 235: Random
     permutation", 1964)."""
-    for i in range(world.row.shape[0] - 1, 0, -1):
-        word, _, _, _ = draw(world, STARTS | i)
-        j = int(word % np.uint64(i + 1))
-        world.row[i], world.row[j] = world.row[j], world.row[i]
-        world.col[i], world.col[j] = world.col[j], world.col[i]
-        world.heading[i], world.heading[j] = world.heading[j], world.heading[i]
+    for last in range(world.row.shape[0] - 1, 0, -1):
+        word, _, _, _ = draw(world, STARTS | last)
+        drawn = int(word % np.uint64(last + 1))
+        world.row[last], world.row[drawn] = world.row[drawn], world.row[last]
+        world.col[last], world.col[drawn] = world.col[drawn], world.col[last]
+        world.heading[last], world.heading[drawn] = world.heading[drawn], world.heading[last]
 
 
 def draw_starts(world: Worlds, tables: Tables) -> None:
@@ -238,46 +244,46 @@ def draw_starts(world: Worlds, tables: Tables) -> None:
     if tables.spawns.shape[0] == 0 and not tables.random_headings:
         return
     # Agents that still need a place are out of play, so that they block none.
-    for i in range(world.row.shape[0]):
-        world.in_play[i] = True
-        for s in range(tables.spawns.shape[0]):
-            if is_at(world, tables, i, s):
-                world.in_play[i] = False
-    for i in range(world.row.shape[0]):
-        if not world.in_play[i]:
-            world.in_play[i] = draw_place(world, tables, i)
+    for agent in range(world.row.shape[0]):
+        world.in_play[agent] = True
+        for place in range(tables.spawns.shape[0]):
+            if is_at(world, tables, agent, place):
+                world.in_play[agent] = False
+    for agent in range(world.row.shape[0]):
+        if not world.in_play[agent]:
+            world.in_play[agent] = draw_place(world, tables, agent)
         elif tables.random_headings:
-            world.heading[i] = draw(world, SPAWNS | i)[1] % np.uint64(4)
+            world.heading[agent] = draw(world, SPAWNS | agent)[1] % np.uint64(4)
 
 
-def draw_place(world: Worlds, tables: Tables, i: int) -> bool:
-    """Put agent i, out of play, at a free spawn place, all equally likely; return whether one is free."""
+def draw_place(world: Worlds, tables: Tables, agent: int) -> bool:
+    """Put an agent, out of play, at a free spawn place, all equally likely; return whether one is free."""
     free_places = 0
-    for s in range(tables.spawns.shape[0]):
-        free_places += is_free(world, tables, s)
+    for place in range(tables.spawns.shape[0]):
+        free_places += is_free(world, tables, place)
     if free_places == 0:
         return False
-    words = draw(world, SPAWNS | i)
+    words = draw(world, SPAWNS | agent)
     places_to_skip = np.int64(words[0] % np.uint64(free_places))
-    for s in range(tables.spawns.shape[0]):
-        if is_free(world, tables, s):
+    for place in range(tables.spawns.shape[0]):
+        if is_free(world, tables, place):
             if places_to_skip == 0:
-                world.row[i] = tables.spawns[s, 0]
-                world.col[i] = tables.spawns[s, 1]
+                world.row[agent] = tables.spawns[place, 0]
+                world.col[agent] = tables.spawns[place, 1]
             places_to_skip -= 1
     if tables.random_headings:
-        world.heading[i] = words[1] % np.uint64(4)
+        world.heading[agent] = words[1] % np.uint64(4)
     return True
 
 
-def is_free(world: Worlds, tables: Tables, s: int) -> bool:
-    """Return whether no agent in play is at spawn place s."""
-    for j in range(world.row.shape[0]):
-        if world.in_play[j] and is_at(world, tables, j, s):
+def is_free(world: Worlds, tables: Tables, place: int) -> bool:
+    """Return whether no agent in play is at a spawn place."""
+    for other in range(world.row.shape[0]):
+        if world.in_play[other] and is_at(world, tables, other, place):
             return False
     return True
 
 
-def is_at(world: Worlds, tables: Tables, i: int, s: int) -> bool:
-    """Return whether agent i is at spawn place s."""
-    return world.row[i] == tables.spawns[s, 0] and world.col[i] == tables.spawns[s, 1]
+def is_at(world: Worlds, tables: Tables, agent: int, place: int) -> bool:
+    """Return whether an agent is at a spawn place."""
+    return world.row[agent] == tables.spawns[place, 0] and world.col[agent] == tables.spawns[place, 1]

@@ -72,12 +72,12 @@ def _concatenated_ranges(starts: Int64, lengths: Int64) -> Int32:
     return numbers + np.repeat((starts - positions).astype(np.int32), lengths)
 
 
-def growth(rules: Rules, around: Int32) -> tuple[Int64, Float64]:
+def growth_probs(rules: Rules, near_counts: Int32) -> tuple[Int64, Float64]:
     """Return the probabilities per turn that sites grow an apple, by the number of apples near them.
 
     Args:
         rules: the rules of the game.
-        around: the number of sites near each site, [K].
+        near_counts: the number of sites near each site, [K].
 
     Returns:
         The row of each site in the table, [K] (or [1], with the row of all sites), and the table of
@@ -85,10 +85,10 @@ def growth(rules: Rules, around: Int32) -> tuple[Int64, Float64]:
         beyond the number of sites near it.
     """
     probs = np.array(rules.regrow_prob)
-    most_near = int(around.max())
+    most_near = int(near_counts.max())
     if rules.regrow_by == "count":
         return np.zeros(1, np.int64), probs[np.minimum(np.arange(most_near + 1), len(probs) - 1)][None]
-    sizes, row_of_site = np.unique(around + (rules.regrow_by == "share_with_own"), return_inverse=True)
+    sizes, row_of_site = np.unique(near_counts + (rules.regrow_by == "share_with_own"), return_inverse=True)
     shares = np.arange(most_near + 1) / np.maximum(sizes, 1)[:, None]
     return row_of_site, np.interp(shares, np.linspace(0, 1, len(probs)), probs)
 

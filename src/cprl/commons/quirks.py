@@ -41,7 +41,7 @@ class Quirks2019(Value):
     window and stays so in the windows of later agents, whether the agent is in play or not."""
 
 
-class Arrays(NamedTuple):
+class QuirkArrays(NamedTuple):
     """The quirks of a game, and the memory that they need in each world."""
 
     freeze_counts_tag_turn: bool
@@ -55,47 +55,47 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
-    return {name: getattr(game.rules.quirks, name) for name in Arrays._fields if name != "stock_before"}
+    """Return the parameters in `QuirkArrays` by name."""
+    return {name: getattr(game.rules.quirks, name) for name in QuirkArrays._fields if name != "stock_before"}
 
 
-def keep_old_stock(world: "Worlds", quirks: Arrays | None) -> None:
+def keep_old_stock(world: "Worlds", quirks: QuirkArrays | None) -> None:
     """Copy the stock at the start of a turn, since the picture of this turn may show it."""
     if quirks is not None:
-        for k in range(world.stock.shape[0]):
-            quirks.stock_before[k] = world.stock[k]
+        for site in range(world.stock.shape[0]):
+            quirks.stock_before[site] = world.stock[site]
 
 
-def shows_apple(world: "Worlds", quirks: Arrays | None, k: int) -> bool:
-    """Return whether the picture shows an apple on site k."""
+def shows_apple(world: "Worlds", quirks: QuirkArrays | None, site: int) -> bool:
+    """Return whether the picture shows an apple on a site."""
     if quirks is not None and quirks.picture_shows_old_stock:
-        return quirks.stock_before[k] == 1
-    return world.stock[k] == 1
+        return quirks.stock_before[site] == 1
+    return world.stock[site] == 1
 
 
-def turns_missed(freeze_steps: int, quirks: Arrays | None) -> int:
+def turns_missed(freeze_steps: int, quirks: QuirkArrays | None) -> int:
     """Return the number of turns that an agent misses after the turn in which it is tagged."""
     if quirks is not None and quirks.freeze_counts_tag_turn:
         return max(0, freeze_steps - 1)
     return freeze_steps
 
 
-def ends_late(quirks: Arrays | None) -> bool:
+def ends_late(quirks: QuirkArrays | None) -> bool:
     """Return whether an empty board ends an episode only one turn later."""
     return quirks is not None and quirks.ends_one_turn_late
 
 
-def paints_over(quirks: Quirks2019 | Arrays | None) -> bool:
+def paints_over(quirks: Quirks2019 | QuirkArrays | None) -> bool:
     """Return whether heading marks and beams cover what is on their cells."""
     return quirks is not None and quirks.paint_over
 
 
-def self_stays(quirks: Quirks2019 | Arrays | None) -> bool:
+def self_stays(quirks: Quirks2019 | QuirkArrays | None) -> bool:
     """Return whether an agent stays painted as "self" in the windows of later agents."""
     return quirks is not None and quirks.self_paint_stays
 
 
-def mark_ahead(heading: int, quirks: Arrays | None) -> int:
+def mark_ahead(heading: int, quirks: QuirkArrays | None) -> int:
     """Return how many cells ahead of an agent its heading mark is: 1, or -1 for behind it."""
     if quirks is not None and quirks.mark_behind_if_vertical and heading in (UP, DOWN):
         return -1

@@ -59,20 +59,20 @@ class River(Value):
             )
 
 
-class Arrays(NamedTuple):
+class RiverArrays(NamedTuple):
     """The river of a game, which has R cells, and its state in each world."""
 
-    cell: Annotated[UInt32, "R"]
+    board_cell: Annotated[UInt32, "R"]
     """The index on the board of each cell of the river; cells as in `cprl.commons.tables.Tables`."""
-    at: Annotated[Int32, "cells"]
+    river_cell_at: Annotated[Int32, "cells"]
     """The index in the river of each cell of the board, or -1."""
     first_waste: Annotated[UInt8, "R"]
     """1 where a cell of the river has waste when an episode begins."""
     pollute_below: Annotated[Int64, "counts"]
     """Thresholds [R + 1], by the number of clean cells: one of them gets waste if a uniform 32-bit word is
     below the threshold."""
-    limit: float
-    free: float
+    pollution_limit: float
+    pollution_free: float
     clean_number: int
     """The index of the action "clean"; -1 if agents may not clean."""
     waste: Annotated[UInt8, "B R", InState(high=1, cleared=False)]
@@ -84,54 +84,54 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
+    """Return the parameters in `RiverArrays` by name."""
     river = game.rules.river
     cells = [cell_of(row, col, game.tables) for row, col in game.map.river]
     river_index = np.full(game.tables.background.size, -1)
     river_index[cells] = range(len(cells))
     stays_clean_prob = 1 - river.pollution_prob
     return {
-        "cell": cells,
-        "at": river_index,
+        "board_cell": cells,
+        "river_cell_at": river_index,
         "first_waste": np.isin(np.arange(len(cells)), game.map.waste),
         "pollute_below": [threshold(1 - stays_clean_prob**count) for count in range(len(cells) + 1)],
-        "limit": river.pollution_limit,
-        "free": river.pollution_free,
+        "pollution_limit": river.pollution_limit,
+        "pollution_free": river.pollution_free,
         "clean_number": game.rules.actions.index(CLEAN) if river.may_clean else -1,
     }
 
 
-def begin_river(river: Arrays | None) -> None:
+def begin_river(river: RiverArrays | None) -> None:
     """Begin an episode: put waste on the cells that the map gives waste, and clear what agents cleaned."""
     if river is not None:
-        for r in range(river.waste.shape[0]):
-            river.waste[r] = river.first_waste[r]
-        for i in range(river.cleans.shape[0]):
-            river.cleans[i] = False
+        for river_cell in range(river.waste.shape[0]):
+            river.waste[river_cell] = river.first_waste[river_cell]
+        for agent in range(river.cleans.shape[0]):
+            river.cleans[agent] = False
         count_waste(river)
 
 
-def count_waste(river: Arrays | None) -> None:
+def count_waste(river: RiverArrays | None) -> None:
     """Count the cells with waste."""
     if river is not None:
         river.waste_left[0] = 0
-        for r in range(river.waste.shape[0]):
-            river.waste_left[0] += river.waste[r]
+        for river_cell in range(river.waste.shape[0]):
+            river.waste_left[0] += river.waste[river_cell]
 
 
-def aim_to_clean(river: Arrays | None, i: int, is_in_play: bool, action: int) -> None:
-    """Note whether agent i cleans in this turn by its action."""
+def aim_to_clean(river: RiverArrays | None, agent: int, is_in_play: bool, action: int) -> None:
+    """Note whether an agent cleans in this turn by its action."""
     if river is not None:
-        river.cleans[i] = is_in_play and action == river.clean_number
+        river.cleans[agent] = is_in_play and action == river.clean_number
 
 
-def is_cleaning(river: Arrays | None, i: int) -> bool:
-    """Return whether agent i cleaned by its latest action."""
-    return river is not None and river.cleans[i]
+def is_cleaning(river: RiverArrays | None, agent: int) -> bool:
+    """Return whether an agent cleaned by its latest action."""
+    return river is not None and river.cleans[agent]
 
 
 def clean(
-    world: "Worlds", tables: "Tables", river: Arrays | None, scratch: "Scratch", cleaned: Float32
+    world: "Worlds", tables: "Tables", river: RiverArrays | None, scratch: "Scratch", cleaned: Float32
 ) -> None:
     """Let the agents that clean fire their beams one after another, in an order drawn by chance.
 
@@ -139,58 +139,58 @@ def clean(
     """
     if river is not None:
         draw_order(world, scratch)
-        for n in range(world.row.shape[0]):
-            i = scratch.order[n]
-            cleaned[i] = 0.0
-            if river.cleans[i]:
+        for position in range(world.row.shape[0]):
+            agent = scratch.order[position]
+            cleaned[agent] = 0.0
+            if river.cleans[agent]:
                 for side in range(-tables.beam_half_width, tables.beam_half_width + 1):
-                    cleaned[i] += clean_column(world, tables, river, i, side)
+                    cleaned[agent] += clean_column(world, tables, river, agent, side)
 
 
-def clean_column(world: "Worlds", tables: "Tables", river: Arrays, i: int, side: int) -> int:
-    """Clean the first cell with waste in a column of agent i's beam; return the number of cells cleaned.
+def clean_column(world: "Worlds", tables: "Tables", river: RiverArrays, cleaner: int, side: int) -> int:
+    """Clean the first cell with waste in a column of an agent's beam; return the number of cells cleaned.
 
     The column ends at this cell, at a wall or at an agent, so the number is 0 or 1.
     """
-    for ahead in range(beam_begin(tables, side), beam_end(world, tables, i, side) + 1):
-        cell = beam_cell(world, tables, i, ahead, side)
+    for ahead in range(beam_begin(tables, side), beam_end(world, tables, cleaner, side) + 1):
+        cell = beam_cell(world, tables, cleaner, ahead, side)
         if tables.background[cell] == tables.paints[WALL]:
             return 0
-        r = river.at[cell]
-        if r >= 0 and river.waste[r] == 1:
-            river.waste[r] = 0
+        river_cell = river.river_cell_at[cell]
+        if river_cell >= 0 and river.waste[river_cell] == 1:
+            river.waste[river_cell] = 0
             river.waste_left[0] -= 1
             return 1
-        for j in range(world.row.shape[0]):
-            if world.in_play[j] and cell_of(world.row[j], world.col[j], tables) == cell:
+        for agent in range(world.row.shape[0]):
+            if world.in_play[agent] and cell_of(world.row[agent], world.col[agent], tables) == cell:
                 return 0
     return 0
 
 
-def write_waste(river: Arrays | None, waste: Int64) -> None:
+def write_waste(river: RiverArrays | None, waste: Int64) -> None:
     """Write the number of cells with waste; `waste`: int64 [1]."""
     if river is not None:
         waste[0] = river.waste_left[0]
 
 
-def growth_share(river: Arrays | None) -> float:
+def growth_share(river: RiverArrays | None) -> float:
     """Return the factor, 0..1, by which the waste in the river reduces the growth of apples."""
     if river is None:
         return 1.0
     share = river.waste_left[0] / max(1, river.waste.shape[0])
-    if share >= river.limit:
+    if share >= river.pollution_limit:
         return 0.0
-    return min(1.0, (river.limit - share) / (river.limit - river.free))
+    return min(1.0, (river.pollution_limit - share) / (river.pollution_limit - river.pollution_free))
 
 
-def slowed(below: int, river: Arrays | None) -> int:
+def reduced_threshold(below: int, river: RiverArrays | None) -> int:
     """Return the threshold `below` of a site's growth, reduced by the waste in the river."""
     if river is None:
         return below
     return int(below * growth_share(river))
 
 
-def pollute(world: "Worlds", river: Arrays | None) -> None:
+def pollute(world: "Worlds", river: RiverArrays | None) -> None:
     """Put waste on one clean cell of the river or on none, by chance; all clean cells are equally likely."""
     if river is None:
         return
@@ -200,9 +200,9 @@ def pollute(world: "Worlds", river: Arrays | None) -> None:
     if growth_share(river) == 0.0 or np.int64(words[0]) >= river.pollute_below[clean_cells]:
         return
     cells_to_skip = np.int64(words[1] % np.uint64(clean_cells))
-    for r in range(cells):
-        if river.waste[r] == 0:
+    for river_cell in range(cells):
+        if river.waste[river_cell] == 0:
             if cells_to_skip == 0:
-                river.waste[r] = 1
+                river.waste[river_cell] = 1
                 river.waste_left[0] += 1
             cells_to_skip -= 1

@@ -7,14 +7,13 @@ these signs: [W] M. Wiatrak, "Governing the Commons with Multi-Agent Reinforceme
 sequential_social_dilemma_games, harvest, [C] its cleanup; [SJ] SocialJax, harvest_open.
 """
 
-import sys
 from dataclasses import dataclass, fields
 from typing import Annotated, Final, Literal, NamedTuple, get_args, get_type_hints
 
-from cprl.commons import quirks, river, signals
 from cprl.commons.chance import Probability
-from cprl.commons.quirks import Quirks2019
-from cprl.commons.river import CLEAN, River
+from cprl.commons.quirks import QuirkArrays, Quirks2019
+from cprl.commons.river import CLEAN, River, RiverArrays
+from cprl.commons.signals import SignalArrays
 from cprl.values import MOST_INT32, Natural, Odd, Positive, Range, Value, Where
 
 ACTIONS: Final = ("forward", "backward", "left", "right", "turn_left", "turn_right", "beam", "stay")
@@ -231,12 +230,11 @@ class RuleGroups(NamedTuple):
     An entry is None for a game without the group. Numba then compiles no code that depends on the group.
     """
 
-    river: river.Arrays | None
-    quirks: quirks.Arrays | None
-    signals: signals.Arrays | None
+    river: RiverArrays | None
+    quirks: QuirkArrays | None
+    signals: SignalArrays | None
 
 
-GROUPS: Final = {
-    name: sys.modules[get_args(kind)[0].__module__] for name, kind in get_type_hints(RuleGroups).items()
-}
-"""The module of each group of rules, which defines its `Arrays` and `parameters`."""
+GROUP_ARRAYS: Final = {name: get_args(kind)[0] for name, kind in get_type_hints(RuleGroups).items()}
+"""The class of the arrays of each group of rules; its module defines `parameters(game)`, which returns the
+values that follow from the game."""

@@ -8,7 +8,7 @@ from cprl.commons.cells import GROUND, WALL, WATER
 from cprl.commons.chance import REST_BITS
 from cprl.commons.headings import COL_STEP, ROW_STEP
 from cprl.commons.maps import Map
-from cprl.commons.near import growth, neighbours
+from cprl.commons.near import growth_probs, neighbours
 from cprl.commons.rules import HARVEST_ACTION, Clashes, Growth, RandomEnd, Rules
 from cprl.commons.views import CLASS_SHIFT
 from cprl.institutions.institution import threshold
@@ -220,7 +220,7 @@ def _paints(game: "Game") -> Int32:
 def _growth_tables(board: Map, rules: Rules) -> dict[str, Any]:
     """Return the tables about the growth of apples."""
     near_first, near_sites = neighbours(board, rules)
-    row_of_site, probs = growth(rules, np.diff(near_first))
+    row_of_site, probs = growth_probs(rules, np.diff(near_first))
     thresholds = np.array([threshold(prob) for prob in probs.reshape(-1)], np.int64)
     return {
         "near_first": near_first,

@@ -124,7 +124,7 @@ class CpuThreads:
 
         The calling thread works on the last share. `run`: called with working memory and a range of worlds.
         """
-        bounds = [self._worlds * t // self.threads for t in range(self.threads + 1)]
+        bounds = [self._worlds * thread // self.threads for thread in range(self.threads + 1)]
         *others, last_share = zip(self._scratch, bounds, bounds[1:], strict=False)
         shares = [_pool(os.getpid(), len(others)).submit(run, *share) for share in others]
         run(*last_share)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from cprl.commons.actions import act
+from cprl.commons.actions import apply_actions
 from cprl.commons.apples import fill, harvest_and_grow, recount
 from cprl.commons.beam import find_hits, tag, take_out
 from cprl.commons.chance import BALLOT, DETECTION, END, draw
@@ -23,7 +23,7 @@ from cprl.commons.river import begin_river, clean, count_waste, write_waste
 from cprl.commons.signals import draw_signals
 from cprl.commons.views import draw_institutions, draw_scores, draw_windows, has_apple_ahead
 from cprl.commons.world import BEGIN, PLAY, PLAYING, REFRESH, TERMINATED, TRUNCATED
-from cprl.institutions.hooks import begin, open_turn, refresh, settle
+from cprl.institutions.hooks import forget_last_episode, open_turn, refresh_derived, settle_accounts
 from cprl.institutions.ledger import charge, count_violation, forget_episode, forget_turn
 from cprl.institutions.sanctioner import appoint
 from cprl.institutions.sanctions import sanction_violation
@@ -88,7 +88,7 @@ def play_turn(
     world.step[0] += 1
     begin_turn(world, law, decisions)
     count_down(world)
-    act(world, tables, law, actions, scratch)
+    apply_actions(world, tables, law, actions, scratch)
     settle_clashes(world, tables, scratch)
     clean(world, tables, world.groups.river, scratch, output.cleaned)
     output.regrown[0] = harvest_and_grow(world, tables, law, actions, scratch, output.harvest)
@@ -143,30 +143,30 @@ def ends_by_chance(world: Worlds, tables: Tables) -> bool:
 
 def note_events(world: Worlds, output: StepOutput) -> None:
     """Write which agents fired, and note which are on the board."""
-    for i in range(world.row.shape[0]):
-        output.fired[i] = world.fired[i]
-        world.on_board[i] = world.in_play[i]
+    for agent in range(world.row.shape[0]):
+        output.fired[agent] = world.fired[agent]
+        world.on_board[agent] = world.in_play[agent]
 
 
 def keep_on_board(world: Worlds) -> None:
     """Keep agents on the board that were tagged in this turn but miss no turn, so that they are back in
     play."""
-    for i in range(world.row.shape[0]):
-        if world.in_play[i] and world.tagged_step[i] == world.step[0]:
-            world.on_board[i] = True
+    for agent in range(world.row.shape[0]):
+        if world.in_play[agent] and world.tagged_step[agent] == world.step[0]:
+            world.on_board[agent] = True
 
 
 def clear_events(world: Worlds, law: Law | None, output: StepOutput) -> None:
     """Write an output without events: no harvest, shot, hit, growth, fine or transfer."""
     agents = world.row.shape[0]
-    for i in range(agents):
-        output.harvest[i] = 0.0
-        output.fired[i] = False
-        for j in range(agents):
-            output.hit_by[i, j] = False
-            output.tagged_by[i, j] = False
-    for i in range(output.cleaned.shape[0]):
-        output.cleaned[i] = 0.0
+    for agent in range(agents):
+        output.harvest[agent] = 0.0
+        output.fired[agent] = False
+        for shooter in range(agents):
+            output.hit_by[agent, shooter] = False
+            output.tagged_by[agent, shooter] = False
+    for agent in range(output.cleaned.shape[0]):
+        output.cleaned[agent] = 0.0
     output.regrown[0] = 0
     if law is not None:
         forget_turn(law.ledger)
@@ -174,11 +174,11 @@ def clear_events(world: Worlds, law: Law | None, output: StepOutput) -> None:
 
 def write_state(world: Worlds, tables: Tables, output: StepOutput, scratch: Scratch) -> None:
     """Write the current state, every agent's observation, and the rewards before institutions."""
-    for i in range(world.row.shape[0]):
-        output.in_play[i] = world.in_play[i]
-        output.reward[i] = output.harvest[i]
+    for agent in range(world.row.shape[0]):
+        output.in_play[agent] = world.in_play[agent]
+        output.reward[agent] = output.harvest[agent]
         if output.apple_ahead.shape[1] > 0:
-            output.apple_ahead[i, 0] = has_apple_ahead(world, tables, i)
+            output.apple_ahead[agent, 0] = has_apple_ahead(world, tables, agent)
     output.stock[0] = world.stock_left[0]
     write_waste(world.groups.river, output.waste)
     output.terminated[0] = world.ended[0] == TERMINATED
@@ -212,7 +212,7 @@ def begin_turn(world: Worlds, law: Law | None, decisions: Int64) -> None:
 def end_turn(world: Worlds, law: Law | None) -> None:
     """Let institutions collect, pay and forgive at the end of a turn."""
     if law is not None:
-        settle(law, world.step[0], world.ended[0] != PLAYING)
+        settle_accounts(law, world.step[0], world.ended[0] != PLAYING)
 
 
 def open_next_turn(world: Worlds, law: Law | None) -> None:
@@ -229,7 +229,7 @@ def begin_institutions(world: Worlds, law: Law | None) -> None:
     if law is None:
         return
     forget_episode(law.ledger)
-    begin(law)
+    forget_last_episode(law)
     if world.episode[0] == 0:
         for ballot in range(law.votes.options.shape[0]):
             law.ledger.in_force[ballot] = law.votes.choices[ballot, 0]
@@ -240,7 +240,7 @@ def begin_institutions(world: Worlds, law: Law | None) -> None:
 def refresh_institutions(world: Worlds, law: Law | None) -> None:
     """Compute what institutions derive from the state of the world, and clear the events of a turn."""
     if law is not None:
-        refresh(law, world.stock)
+        refresh_derived(law, world.stock)
         forget_turn(law.ledger)
 
 
@@ -253,15 +253,15 @@ def pursue_violations(world: Worlds, law: Law | None) -> None:
     """Detect violations of this turn by chance; detected agents pay fines and may miss turns."""
     if law is None:
         return
-    for i in range(world.row.shape[0]):
-        law.ledger.detected[i] = False
-        if count_violation(law.ledger, i, world.step[0]):
-            word = np.int64(draw(world, DETECTION + i)[0])
+    for agent in range(world.row.shape[0]):
+        law.ledger.detected[agent] = False
+        if count_violation(law.ledger, agent, world.step[0]):
+            word = np.int64(draw(world, DETECTION + agent)[0])
             if word < law.monitoring.detected_below:
-                charge(law.ledger, i)
-                steps = sanction_violation(law.sanctions, law.ledger, i, world.step[0])
+                charge(law.ledger, agent)
+                steps = sanction_violation(law.sanctions, law.ledger, agent, world.step[0])
                 if steps > 0:
-                    take_out(world, i, steps)
+                    take_out(world, agent, steps)
 
 
 def write_payments(world: Worlds, tables: Tables, law: Law | None, output: StepOutput) -> None:
@@ -270,15 +270,15 @@ def write_payments(world: Worlds, tables: Tables, law: Law | None, output: StepO
     if law is None:
         return
     ledger = law.ledger
-    if law.entries.places or law.entries.what.shape[0] > 0:
+    if law.entries.shows_places or law.entries.entry.shape[0] > 0:
         draw_institutions(world, tables, law, output.observation)
-    for i in range(world.row.shape[0]):
-        output.fines[i] = ledger.fines[i]
-        output.transfers[i] = ledger.transfers[i]
-        output.reward[i] = output.harvest[i] - ledger.fines[i] + ledger.transfers[i]
-        output.violated[i] = ledger.broke[i]
-        for count in range(ledger.counts.shape[1]):
-            output.counts[i, count] = ledger.counts[i, count]
+    for agent in range(world.row.shape[0]):
+        output.fines[agent] = ledger.fines[agent]
+        output.transfers[agent] = ledger.transfers[agent]
+        output.reward[agent] = output.harvest[agent] - ledger.fines[agent] + ledger.transfers[agent]
+        output.violated[agent] = ledger.has_violated[agent]
+        for count_index in range(ledger.counts.shape[1]):
+            output.counts[agent, count_index] = ledger.counts[agent, count_index]
     for ballot in range(output.in_force.shape[0]):
         output.in_force[ballot] = ledger.in_force[ballot]
     for ballot in range(output.ballots_due.shape[0]):

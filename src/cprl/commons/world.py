@@ -3,12 +3,13 @@
 The rules are written for one world, and get these named tuples of arrays without the axis B.
 """
 
+import sys
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 
 from cprl.commons.chance import SITES_PER_DRAW
-from cprl.commons.rules import GROUPS, RuleGroups
+from cprl.commons.rules import GROUP_ARRAYS, RuleGroups
 from cprl.institutions.arrays import DERIVED, IN_STATE, STEPS, InState, filled, forms_of
 from cprl.values.array_types import Bool, Float32, Int32, Int64, UInt8, UInt32, UInt64
 
@@ -166,8 +167,8 @@ def _empty_group(game: "Game", name: str, sizes: dict[str, int]) -> Any:
     """Return the arrays of a group of rules for new worlds; None if the game lacks the group."""
     if not getattr(game.rules, name):
         return None
-    module = GROUPS[name]
-    return filled(module.Arrays, module.parameters(game), **sizes)
+    kind = GROUP_ARRAYS[name]
+    return filled(kind, sys.modules[kind.__module__].parameters(game), **sizes)
 
 
 CACHE_LINE_BYTES = 128

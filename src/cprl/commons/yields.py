@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from cprl.commons.maps import Map
-from cprl.commons.near import growth, harvest_rates, sites_around
+from cprl.commons.near import growth_probs, harvest_rates, sites_around
 from cprl.commons.rules import Rules
 from cprl.values.array_types import Float64, Int64
 
@@ -64,7 +64,7 @@ def sustainable_yield(board: Map, rules: Rules) -> float:
     """
     check_proven(rules)
     around = sites_around(board, rules)
-    row_of_site, probs = growth(rules, np.array([len(sites) for sites in around], np.int32))
+    row_of_site, probs = growth_probs(rules, np.array([len(sites) for sites in around], np.int32))
     rates = harvest_rates(rules, probs)
     return _greedy_yield(np.broadcast_to(rates[row_of_site], (len(around), rates.shape[1])), around)
 
@@ -86,21 +86,21 @@ def _greedy_yield(rate: Float64, around: list[Int64]) -> float:
     unharvested_near = np.array([len(near_sites) for near_sites in around])
     harvested = np.zeros(site_count, np.bool_)
 
-    def gain(k: int) -> float:
-        """Return the yield of site k, less the loss of the harvested sites near it, if it is added."""
-        losers = around[k][harvested[around[k]]]
+    def gain(site: int) -> float:
+        """Return the yield of a site, less the loss of the harvested sites near it, if it is added."""
+        losers = around[site][harvested[around[site]]]
         counts = unharvested_near[losers]
         losses = rate[losers, counts] - rate[losers, counts - 1]
-        return float(rate[k, unharvested_near[k]] - losses.sum())
+        return float(rate[site, unharvested_near[site]] - losses.sum())
 
-    gains = np.array([gain(k) for k in range(site_count)])
+    gains = np.array([gain(site) for site in range(site_count)])
     while True:
         gains[harvested] = 0
-        k = int(gains.argmax())
-        if gains[k] <= _SMALLEST_GAIN:
+        best = int(gains.argmax())
+        if gains[best] <= _SMALLEST_GAIN:
             return float(rate[harvested, unharvested_near[harvested]].sum())
-        harvested[k] = True
-        unharvested_near[around[k]] -= 1
-        affected = {k, *around[k].tolist(), *(int(j) for i in around[k] for j in around[i])}
-        for site in affected:
+        harvested[best] = True
+        near = around[best].tolist()
+        unharvested_near[near] -= 1
+        for site in {best, *near, *(int(second) for first in near for second in around[first])}:
             gains[site] = gain(site)

@@ -11,12 +11,13 @@ from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 from torchrl.data import Bounded, Categorical, Composite, TensorSpec, Unbounded
 
-from cprl import keys, recurrent_state
+from cprl import keys
 from cprl.commons.batch import Batch
 from cprl.commons.game import Game, output_forms
 from cprl.commons.world import PLAYING, StepOutput
 from cprl.envs.drivers import device_of, drawn_seed, driver_for
 from cprl.envs.stepping import carry_on, read_choices
+from cprl.keys import recurrent_state
 from cprl.pictures.image import world_image
 from cprl.system.compat.tensordicts import unchecked_tensordict
 from cprl.system.compat.torchrl import LeanStepEnv, flag_spec
@@ -227,7 +228,7 @@ class CommonsEnv(LeanStepEnv):
             agents["reward"] = reward
         entries: dict[str, Any] = {name: tensors[name] for name in (*self._world_entries, *_DONE_ENTRIES)}
         if self.game.governor is not None:
-            entries[keys.SEEN] = torch.as_tensor(self.worlds.seen(), device=self.device)
+            entries[keys.SEEN] = torch.as_tensor(self.worlds.governor_features(), device=self.device)
         if self._has_state:
             boards = torch.as_tensor(self.worlds.boards(), device=self.device)
             entries[keys.STATE] = self._colours[boards.long()].permute(0, 3, 1, 2)
@@ -292,6 +293,9 @@ class CommonsEnv(LeanStepEnv):
 
         Returns:
             A numpy array in RGB: uint8 [rows, columns, 3] for one world, uint8 [B, rows, columns, 3] for all.
+
+        Raises:
+            ValueError: before the first reset, or for a world that the environment does not have.
         """
         batch = self.worlds
         if not batch.has_begun:

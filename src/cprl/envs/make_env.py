@@ -102,7 +102,11 @@ def make_env(
 
 
 def spaces_of(env: EnvBase) -> Spaces:
-    """Return the observation and action spaces of the agents, as they are after all transforms."""
+    """Return the observation and action spaces of the agents, as they are after all transforms.
+
+    Raises:
+        ValueError: if either is missing, or has another form than `PlayableGame` says.
+    """
     observation_spec = _agents_spec(env, "observation")
     action_spec = _agents_spec(env, "action")
     if not isinstance(action_spec, Categorical) or action_spec.ndim != 2:
@@ -185,6 +189,9 @@ def game_of(stored: Custom) -> Custom | PlayableGame:
 
     A `Custom` that does not stand for a game's class and arguments, such as one with a function that makes a
     game, is returned itself.
+
+    Raises:
+        ValueError: if the class does not take the arguments.
     """
     game_class = stored.resolve()
     is_game_class = isinstance(game_class, type) and hasattr(game_class, "to_config")

@@ -127,7 +127,7 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
                 f"actions has the agents {short_repr(list(actions))}; allowed: exactly {self.agents}"
             )
         self.play([actions[name] for name in self.agents])
-        rewards = {name: self.reward(i) for i, name in enumerate(self.agents)}
+        rewards = {name: self.reward(agent) for agent, name in enumerate(self.agents)}
         terminations = dict.fromkeys(self.agents, self.terminated)
         truncations = dict.fromkeys(self.agents, self.truncated)
         result = self._observations(), rewards, terminations, truncations, self._infos()
@@ -203,10 +203,10 @@ class CommonsParallelEnv(ParallelEnv[str, Any, int]):
         return world_image(self.game.map, self.batch.show(self.output))
 
     def _observations(self) -> dict[str, UInt8]:
-        return {name: self.observation(i) for i, name in enumerate(self.agents)}
+        return {name: self.observation(agent) for agent, name in enumerate(self.agents)}
 
     def _infos(self) -> Infos:
-        return {name: self.info(i) for i, name in enumerate(self.agents)}
+        return {name: self.info(agent) for agent, name in enumerate(self.agents)}
 
 
 def parallel_env(

@@ -6,7 +6,8 @@ import torch
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from cprl import keys, recurrent_state
+from cprl import keys
+from cprl.keys import recurrent_state
 from cprl.system.compat.tensordicts import put_all
 
 _INTEGER_DTYPES: Final = (torch.int64, torch.int32, torch.int16, torch.int8, torch.uint8)

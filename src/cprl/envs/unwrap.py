@@ -37,7 +37,11 @@ def clock_in(game: object) -> int | None:
 
 
 def agent_count(env: EnvBase) -> int:
-    """Return the number of agents N, read from the shape of ("agents", "reward"), [B, N, 1]."""
+    """Return the number of agents N, read from the shape of ("agents", "reward"), [B, N, 1].
+
+    Raises:
+        ValueError: if the batch size is not [B], or the reward is missing or has another shape.
+    """
     size = tuple(env.batch_size)
     if len(size) != 1:
         raise ValueError(f"the environment has batch size {list(size)}; allowed: [B], B worlds")

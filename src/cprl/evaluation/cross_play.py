@@ -14,7 +14,7 @@ but not together with the background agents, so that only the first difference r
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
 import pyarrow as pa
 
@@ -30,7 +30,7 @@ from cprl.evaluation.populations import (
 )
 from cprl.measuring.registry import COLLECTIVE_RETURN, FINES_TOTAL, INCOME, with_unit
 from cprl.measuring.statistics import HOLM_NOTE, Family, differences, estimates
-from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, Label, all_metrics, labelled, where
+from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, all_metrics, labelled, where
 from cprl.system.defaults import Diagonal, Fresh
 from cprl.system.working import working
 from cprl.terminal import style
@@ -68,6 +68,10 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
         A table with a row for each cell, focal agent, replica, episode and agent, see
         `cprl.measuring.table`. The columns "focal" and "background" have the names of the runs, "focal_agent"
         the index of the focal agent, -1 in self-play. "replica" is that of the background agents.
+
+    Raises:
+        ValueError: for fewer than two runs, a run given twice, runs of different games or of a game with one
+            agent, no replica in common, or a seed with which a run was trained.
     """
     checked("diagonal", diagonal, Diagonal)
     loaded = named_runs(runs)
@@ -76,36 +80,41 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
     if diagonal == "cross_seed" and len(replicas) < 2:
         raise ValueError(f"the replicas are {list(replicas)}; allowed for cross_seed: at least 2")
     next_replica = dict(zip(replicas, (*replicas[1:], replicas[0]), strict=True))
-
-    def populations(focal: str, background: str) -> Iterator[tuple[int, list[AgentOfReplica]]]:
-        """Yield the index of each focal agent of a cell, and all agents; in self-play `_SELF_PLAY` alone."""
-        background_agents = agents_of(loaded[background])
-        if focal == background and diagonal == "self":
-            yield _SELF_PLAY, background_agents
-            return
-        stored_replicas = next_replica if focal == background else None
-        focal_agents = agents_of(loaded[focal], stored_replicas)
-        for index, focal_agent in enumerate(focal_agents):
-            yield index, [*background_agents[:index], focal_agent, *background_agents[index + 1 :]]
-
-    def cell_tables() -> Iterator[pa.Table]:
-        for focal, background in product(loaded, repeat=2):
-            for index, agents in populations(focal, background):
-                labels: Label = {FOCAL: focal, BACKGROUND: background, "focal_agent": index}
-                roles = roles_of(len(agents), [index])
-                if index == _SELF_PLAY:
-                    roles = [BOTH] * len(agents)
-                yield play_fresh(
-                    fresh, loaded[background], agents, labels, roles=roles, among=loaded.values()
-                )
-
+    tables = (
+        play_fresh(
+            fresh, loaded[labels[BACKGROUND]], agents, labels, roles=roles, compared_runs=loaded.values()
+        )
+        for labels, agents, roles in _cells(loaded, diagonal, next_replica)
+    )
     per_focal_agent = " with focal agent at each index"
     return join_tables(
-        cell_tables(),
+        tables,
         heading=heading("Cross-play", fresh, loaded.values(), per_focal_agent, f", diagonal: {diagonal}"),
         fresh=fresh,
         diagonal=diagonal,
     )
+
+
+def _cells(
+    runs: Mapping[str, LoadedRun], diagonal: Diagonal, next_replica: Mapping[int, int]
+) -> Iterator[tuple[dict[str, Any], list[AgentOfReplica], list[str]]]:
+    """Yield the labels, the agents and their roles for each cell and each index of the focal agent.
+
+    Args:
+        runs: the runs by name.
+        diagonal: as in `crossplay`.
+        next_replica: with "cross_seed", the replica of the focal agent by that of the background agents.
+    """
+    for focal, background in product(runs, repeat=2):
+        labels = {FOCAL: focal, BACKGROUND: background}
+        background_agents = agents_of(runs[background])
+        if focal == background and diagonal == "self":
+            yield labels | {"focal_agent": _SELF_PLAY}, background_agents, [BOTH] * len(background_agents)
+            continue
+        focal_agents = agents_of(runs[focal], next_replica if focal == background else None)
+        for index, focal_agent in enumerate(focal_agents):
+            agents = [*background_agents[:index], focal_agent, *background_agents[index + 1 :]]
+            yield labels | {"focal_agent": index}, agents, roles_of(len(agents), [index])
 
 
 def named_runs(runs: Runs) -> dict[str, LoadedRun]:
@@ -142,17 +151,21 @@ def gains(table: pa.Table) -> Family:
     either, so that a gain comes from the focal agent's run alone.
 
     Returns:
-        The differences, by "focal" and "background".
+        The differences; the keys of the family are (focal, background, metric).
     """
 
-    def diagonal(cell: Mapping[str, str]) -> dict[str, str]:
+    def self_play_cell(cell: Mapping[str, str]) -> dict[str, str]:
         return {FOCAL: cell[BACKGROUND]}
 
-    return differences(table, [FOCAL_RETURN, BACKGROUND_RETURN], CELL_LABELS, diagonal)
+    return differences(table, [FOCAL_RETURN, BACKGROUND_RETURN], CELL_LABELS, self_play_cell)
 
 
 def by_focal_agent(table: pa.Table) -> pa.Table:
-    """Return the table of a cross-play with the rows of self-play once for each agent as the focal agent."""
+    """Return the table of a cross-play with a focal agent in every row.
+
+    Self-play rows belong to no single focal agent: they are repeated for each agent index, with roles as if
+    that agent were focal.
+    """
     agents = len(table["agent"].unique())
     tables = []
     for agent in range(agents):
@@ -175,18 +188,19 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
     The focal agent's run has rows, and that of the background agents columns. A star marks gains that differ
     from 0 by Holm's method for all drawn gains.
     """
-    gained = gains(table)
+    gain_estimates = gains(table)
     returns = estimates(table, FOCAL_RETURN, CELL_LABELS).column(FOCAL_RETURN)
     self_play = {pair: f"{returns[pair].value:.3g}" for pair in returns if pair[0] == pair[1]}
-    unit = f", {rewards_of(table)}".removesuffix(", ")
-    diagonal = table_note(table, "diagonal").replace("_", "-")
-    rows, columns = (dict(zip(labels, labels, strict=True)) for labels in matrix_labels(gained))
+    rewards = rewards_of(table)
+    unit = f", {rewards}" if rewards else ""
+    diagonal_word = table_note(table, "diagonal").replace("_", "-")
+    rows, columns = (dict(zip(labels, labels, strict=True)) for labels in matrix_labels(gain_estimates))
     with style.drawing(path, width=width, colours=style.PNG_SHADES) as sheet:
         panels = sheet.panels(len(_GAINS), high=matrix_height(len(rows)))
         for axes, (metric, panel_title) in zip(panels, _GAINS.items(), strict=True):
             values = {}
             texts = dict(self_play)
-            for pair, estimate in gained.column(metric).items():
+            for pair, estimate in gain_estimates.column(metric).items():
                 values[pair] = estimate.value
                 texts[pair] = f"{estimate.value:+.3g}" + " *" * estimate.differs
             draw_matrix(sheet, axes, rows, columns, values, texts)
@@ -195,7 +209,7 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
         sheet.title = "Cross-play: who gains among whom"
         sheet.caption = (
             f"Difference in return{unit}; {table_note(table, 'fresh')} with focal agent at each index; "
-            f"diagonal ({diagonal}): an agent's return. {HOLM_NOTE} for these {len(gained)}."
+            f"diagonal ({diagonal_word}): an agent's return. {HOLM_NOTE} for these {len(gain_estimates)}."
         )
     return Path(path)
 
@@ -206,11 +220,11 @@ def crossplay_tables(table: pa.Table) -> Iterator[TextTable]:
     In a matrix the focal agent's run has rows, and that of the background agents columns.
     """
     rewards = rewards_of(table)
-    gained = gains(table)
+    gain_estimates = gains(table)
     for metric, sides in _GAINS.items():
         name = with_unit(metric, rewards=rewards)
         title = f"{name}, difference of {sides}, paired by replica [95 % interval by Student's t]"
-        yield matrix_table(gained, metric, title, gained.note("of both tables"))
+        yield matrix_table(gain_estimates, metric, title, gain_estimates.note("of both tables"))
     metrics = dict.fromkeys([*CROSS_PLAY_RETURNS, *all_metrics(table)])
     if FINES_TOTAL not in table.column_names:  # without fines the collective return equals the income
         metrics.pop(COLLECTIVE_RETURN, None)

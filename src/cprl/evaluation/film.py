@@ -75,43 +75,43 @@ def record_episode(
         if Path(out).suffix != ".rrd":
             raise refusal("out", str(out), "a .rrd; film_episode makes a .gif or an .mp4")
         refuse_to_write_over(Path(out))
-    (fresh,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed)
-    default_path = Path(run) / f"film-{fresh.replica}-{fresh.episode}.rrd"
+    (fresh_episode,) = fresh_episodes([run], replica=replica, episode=episode, seed=seed)
+    default_path = Path(run) / f"film-{fresh_episode.replica}-{fresh_episode.episode}.rrd"
     target = Path(out or default_path)
     refuse_to_write_over(target)
-    print_descriptions([fresh])
+    print_descriptions([fresh_episode])
     target.parent.mkdir(parents=True, exist_ok=True)
     try:
-        return target, _record_to_file(fresh, target)
+        return target, _record_to_file(fresh_episode, target)
     except BaseException:  # the next attempt would refuse to overwrite the recording of half an episode
         target.unlink(missing_ok=True)
         raise
 
 
 @working("playing an episode")
-def _record_to_file(fresh: FreshEpisode, target: Path) -> Episode:
+def _record_to_file(fresh_episode: FreshEpisode, target: Path) -> Episode:
     """Play an episode and record all its turns."""
-    env = fresh.env
+    run = fresh_episode.run
+    env = fresh_episode.env
     commons = commons_of(env)
     with ViewerCallback(
         target.parent,
         env,
-        title=f"{legible(fresh.run.path.name)}, replica {fresh.replica}, episode {fresh.episode}",
+        title=f"{legible(run.path.name)}, replica {fresh_episode.replica}, episode {fresh_episode.episode}",
         episodes=1,
-        recipe=fresh.run.recipe,
-        file_name=target.name,
-        is_replay=True,
+        recipe=run.recipe,
+        replay=target.name,
     ) as viewer:
         logger = viewer.logger
         scene = logger.scene
         views: list[Any] = [viewer]
         if scene is not None:
-            views.append(Decisions(logger, scene, fresh.policies, actions=fresh.run.game.actions))
+            views.append(Decisions(logger, scene, fresh_episode.policies, actions=run.game.actions))
             if commons is not None and scene.has_institutions:
                 views.append(ViolationMarks(logger, commons))
         observer = Observer(views, env)
         tracker = tracker_of(env)
-        for step, batch in enumerate(turns(env, fresh.policies), start=1):
+        for step, batch in enumerate(turns(env, fresh_episode.policies), start=1):
             observer.on_step(batch)
             for event in events(batch):
                 _log(viewer, step, event)
@@ -209,10 +209,10 @@ def film_episode(
     episodes = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
     print_descriptions(episodes)
     panels = _panels(episodes, style.titles or titles_of(episodes), width)
-    last = max(panel.played.last for panel in panels)
+    last = max(panel.played.last_turn for panel in panels)
     every = style.every or (1 if is_mp4 else ceil((last + 1) / _GIF_FRAMES))
     filmed_turns = sorted({*range(0, last, every), last})
-    games = [commons_game(fresh.run) for fresh in episodes]
+    games = [commons_game(episode.run) for episode in episodes]
     film_width = sum(panel.picture.size[0] for panel in panels)
     legend = note(f"{growth_of(games[0])} {legend_of(games)}", film_width)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -257,7 +257,7 @@ def titles_of(episodes: Sequence[FreshEpisode]) -> Sequence[str]:
     They are the runs' institutions and transforms; if some of these are equal, the names of the experiments;
     and if some of these are equal too, the names of the directories.
     """
-    runs = [fresh.run for fresh in episodes]
+    runs = [episode.run for episode in episodes]
     rules = [in_lower_case(" and ".join(_rules_in(run))) for run in runs]
     names = [run.experiment.name.replace("_", " ") for run in runs]
     titles = [rule or "no rule" for rule in rules] if any(rules) else names
@@ -294,7 +294,7 @@ class _Panel(NamedTuple):
         played = self.played
         apples, outcome = self._outcome_texts()
         subject = "A typical episode" if self.is_typical else "This episode"
-        has_died = played.is_dead and turn >= played.last
+        has_died = played.is_dead and turn >= played.last_turn
         return self.picture.draw(
             played.boards[: turn + 1],
             self.title,
@@ -310,19 +310,19 @@ class _Panel(NamedTuple):
         count = int(played.boards[-1].harvested.sum())
         apples = f"{count:,} apple{'s' * (count != 1)} picked"
         if played.is_dead:
-            return apples, f"gone for good at turn {played.last:,} of {self.picture.steps:,}"
-        return apples, f"{played.left:,} of {len(self.picture.board.sites):,} still on the board"
+            return apples, f"gone for good at turn {played.last_turn:,} of {self.picture.steps:,}"
+        return apples, f"{played.apples_left:,} of {len(self.picture.board.sites):,} still on the board"
 
 
 def _panels(episodes: Sequence[FreshEpisode], titles: Sequence[str], width: int) -> list[_Panel]:
     """Play the episodes and return their panels, all of the same size and with the same axis of harvests."""
-    games = [commons_game(fresh.run) for fresh in episodes]
-    recorded = [record(fresh) for fresh in episodes]
+    games = [commons_game(episode.run) for episode in episodes]
+    recorded = [record(episode) for episode in episodes]
     most_harvested = max(int(played.boards[-1].harvested.max()) for played in recorded)
     height = max(EpisodePicture(game.map, steps=1, width=width).size[1] for game in games)
     sizes = {"width": width, "height": height, "most_harvested": most_harvested}
     panels = []
-    for title, fresh, game, played in zip(titles, episodes, games, recorded, strict=True):
+    for title, episode, game, played in zip(titles, episodes, games, recorded, strict=True):
         picture = EpisodePicture(game.map, steps=game.rules.episode_steps, **sizes)
-        panels.append(_Panel(title, picture, played, fresh.is_typical))
+        panels.append(_Panel(title, picture, played, episode.is_typical))
     return panels

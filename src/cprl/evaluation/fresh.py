@@ -62,9 +62,9 @@ class FreshEpisode(NamedTuple):
         if not self.is_typical:
             return f"Replica {self.replica}, episode {self.episode}. {averages_sentence}".rstrip()
         averages = averages_of(self.run)
-        turns, apples = _median(averages)
+        survival, apples = _median(averages)
         middle = "the medians of the replicas" if len(averages) > 1 else "the averages"
-        near = f"{middle}, {turns:,.0f} turns and {apples:,.0f} apples"
+        near = f"{middle}, {survival:,.0f} turns and {apples:,.0f} apples"
         reason = f"chosen of the first {EPISODES_TRIED} for a life and a harvest near {near}"
         numbers = f"replica {self.replica}, episode {self.episode}"
         return f"A typical episode ({numbers}), {reason}. {averages_sentence}"
@@ -87,14 +87,14 @@ def averages_of(run: LoadedRun) -> dict[int, tuple[float, float]]:
         return {}
     groups = where(table, replica=tuple(run.replicas)).group_by("replica")
     rows = groups.aggregate([(metric, "mean") for metric in metrics]).sort_by("replica")
-    turns, apples = (rows[f"{metric}_mean"].to_pylist() for metric in metrics)
-    return dict(zip(rows["replica"].to_pylist(), zip(turns, apples, strict=True), strict=True))
+    survival, apples = (rows[f"{metric}_mean"].to_pylist() for metric in metrics)
+    return dict(zip(rows["replica"].to_pylist(), zip(survival, apples, strict=True), strict=True))
 
 
 def _median(averages: Mapping[int, tuple[float, float]]) -> tuple[float, float]:
     """Return the medians over replicas of the turns and of the apples."""
-    turns, apples = np.median([*averages.values()], axis=0).tolist()
-    return turns, apples
+    survival, apples = np.median([*averages.values()], axis=0).tolist()
+    return survival, apples
 
 
 def averages_in_words(run: LoadedRun) -> str:
@@ -102,10 +102,10 @@ def averages_in_words(run: LoadedRun) -> str:
     averages = averages_of(run)
     if not averages:
         return ""
-    turns, apples = map(_list_in_words, zip(*averages.values(), strict=True))
+    survival, apples = map(_list_in_words, zip(*averages.values(), strict=True))
     agents, noun = ("people", "groups") if has_people(run.specs) else ("trained agents", "replicas")
     replicas = f" of the {len(averages)} {noun}" if len(averages) > 1 else ""
-    return f"The {agents}{replicas} last {turns} turns on average and pick {apples} apples."
+    return f"The {agents}{replicas} last {survival} turns on average and pick {apples} apples."
 
 
 def _list_in_words(numbers: Sequence[float]) -> str:
@@ -135,8 +135,12 @@ def fresh_episodes(
         replica: the number of the replica, or group of people; 0 by default if `episode` is given.
         episode: the number of the episode; 0 by default if `replica` is given.
         seed: the seed of the worlds and of all random choices, with which no run may have been trained; by
-            default 20011, or the next seed that differs from all training seeds. The same numbers give the
-            same episodes.
+            default `FILM_SEED`, or the next seed that differs from all training seeds. The same numbers give
+            the same episodes.
+
+    Raises:
+        ValueError: for a replica that a run lacks, a seed with which it was trained, an episode or a seed of
+            a run with people, or turns of people that do not give what they played.
     """
     episode = checked("episode", episode, Annotated[int, Range(0, 2**32 - 1)] | None)
     replica = checked("replica", replica, Natural | None)
@@ -149,7 +153,7 @@ def fresh_episodes(
         seed = fresh_seed(loaded)
     refuse_trained_in(seed, loaded)
     if replica is not None or episode is not None:
-        return [_fresh(run, replica, episode or 0, seed) for run in loaded]
+        return [_fresh_episode(run, replica, episode or 0, seed) for run in loaded]
     return _typical_episodes(loaded, seed)
 
 
@@ -158,12 +162,12 @@ def _typical_episodes(runs: Sequence[LoadedRun], seed: int) -> list[FreshEpisode
 
     def episodes_in_world(world: int) -> list[FreshEpisode]:
         return [
-            _fresh(run, typical_replica(run), world, seed)._replace(is_typical=bool(averages_of(run)))
+            _fresh_episode(run, typical_replica(run), world, seed)._replace(is_typical=bool(averages_of(run)))
             for run in runs
         ]
 
     def distance(world: int) -> float:
-        return sum(_distance(fresh) for fresh in episodes_in_world(world) if fresh.is_typical)
+        return sum(_distance(episode) for episode in episodes_in_world(world) if episode.is_typical)
 
     tried = EPISODES_TRIED if any(map(averages_of, runs)) else 1
     return episodes_in_world(min(range(tried), key=distance))
@@ -188,7 +192,8 @@ def typical_replica(run: LoadedRun) -> int:
     return min(averages, key=lambda replica: np.abs(np.subtract(averages[replica], median)).tolist())
 
 
-def _fresh(run: LoadedRun, replica: int | None, episode: int, seed: int) -> FreshEpisode:
+def _fresh_episode(run: LoadedRun, replica: int | None, episode: int, seed: int) -> FreshEpisode:
+    """Return an episode of a run's replica, by default of its first one; refuse a replica that it lacks."""
     if replica is None:
         replica = run.replicas[0]
     if replica not in run.replicas:
@@ -218,26 +223,26 @@ def _replayed(run: LoadedRun, group: int) -> FreshEpisode:
     if run.experiment.governor is not None:
         choices[keys.RULE] = rows["rule"].to_numpy().reshape(steps, -1)[:, :1]
 
-    def again() -> FreshEpisode:
+    def make_episode() -> FreshEpisode:
         env = run.env(seed=run.experiment.seed, first_world=group)
         return FreshEpisode(run, env, RecordedPolicy(choices), group, 0)
 
-    (episode,) = evaluate(again().env, again().policies)
+    (episode,) = evaluate(make_episode().env, make_episode().policies)
     if episode.harvest is None or episode.harvest.tolist() != stored["harvest"].to_pylist():
         raise ValueError(
             f"{path} is not what group {group} played: replayed, the harvest is {episode.outcome}"
         )
-    return again()
+    return make_episode()
 
 
-def _distance(fresh: FreshEpisode) -> float:
+def _distance(fresh_episode: FreshEpisode) -> float:
     """Play an episode; return the sum of the distances of its turns and apples to their medians.
 
     A distance is relative to its median.
     """
-    median = _median(averages_of(fresh.run))
-    (episode,) = evaluate(fresh.env, fresh.policies, explore=True)
-    outcome = np.array([episode.steps, episode.metrics[COLLECTIVE_RETURN]])
+    median = _median(averages_of(fresh_episode.run))
+    (played,) = evaluate(fresh_episode.env, fresh_episode.policies, explore=True)
+    outcome = np.array([played.steps, played.metrics[COLLECTIVE_RETURN]])
     return float(np.sum(np.abs(outcome - median) / np.maximum(1.0, median)))
 
 
@@ -259,19 +264,19 @@ class Recorded(NamedTuple):
         return np.stack([batch[key][0].numpy(force=True) for batch in self.batches])
 
     @property
-    def last(self) -> int:
-        """Return the number of the last turn."""
+    def last_turn(self) -> int:
+        """Return the number of the last turn, counted from 1."""
         return len(self.batches)
 
     @property
-    def left(self) -> int:
+    def apples_left(self) -> int:
         """Return the number of apples on the board at the end."""
         return int(self.boards[-1].stock.sum())
 
     @property
     def is_dead(self) -> bool:
         """Return whether the board died: no apple was left and none could grow."""
-        return self.episode.terminated and self.left == 0
+        return self.episode.terminated and self.apples_left == 0
 
     @property
     def violated(self) -> Bool:
@@ -288,11 +293,12 @@ class Recorded(NamedTuple):
 
 
 @working("playing an episode")
-def record(fresh: FreshEpisode) -> Recorded:
+def record(fresh_episode: FreshEpisode) -> Recorded:
     """Play an episode and return it with all its turns."""
-    commons = commons_of(fresh.env)
-    tracker = tracker_of(fresh.env, fresh.run.metrics)
-    played = turns(fresh.env, fresh.policies)
+    env = fresh_episode.env
+    commons = commons_of(env)
+    tracker = tracker_of(env, fresh_episode.run.metrics)
+    played = turns(env, fresh_episode.policies)
     boards = [] if commons is None else [board_now(commons)]
     batches = []
     ended: list[Episode] = []

@@ -25,7 +25,7 @@ from cprl.measuring import social
 from cprl.measuring.playing import Policy, turns
 from cprl.measuring.table import where
 from cprl.policies.scripted import SCRIPTED_POLICIES
-from cprl.population import AgentSpec, Scripted
+from cprl.population import Scripted
 from cprl.runs.episodes import read_rows
 from cprl.system.defaults import PLAY_SEED
 from cprl.system.working import working
@@ -152,7 +152,6 @@ def game_and_run(source: str, variant: Variant) -> tuple[Game, LoadedRun | None]
     Raises:
         ValueError: for a word that stands for no game, or a variant that the game lacks.
     """
-    checked("variant", variant, Variant)
     check_game_source(source)
     if source in presets.names():
         return presets.game(source, variant=variant), None
@@ -174,17 +173,6 @@ class _Others(NamedTuple):
     """The run whose agents they are; None for scripted agents."""
     replica: int
     """The replica of the run; 0 for scripted agents."""
-
-    def specs(self, agents: int) -> list[AgentSpec]:
-        """Return the specification of each of N agents, the person's index included."""
-        return [agent_named(self.name, agent, replica=self.replica, name="others") for agent in range(agents)]
-
-    @property
-    def in_words(self) -> str:
-        """Return sentences about a run's agents; "" for scripted ones."""
-        if self.run is None:
-            return ""
-        return f"The others are of replica {self.replica}. {averages_in_words(self.run)}".rstrip()
 
 
 def _others_from(others: str | None, game_source: str, run: LoadedRun | None, replica: int | None) -> _Others:
@@ -245,12 +233,19 @@ def open_session(
     if seed is None:
         seed = fresh_seed(runs_of_others, PLAY_SEED)
     refuse_trained_in(seed, runs_of_others)
-    specs = other_agents.specs(game.agents)
+    specs = [
+        agent_named(other_agents.name, index, replica=other_agents.replica, name="others")
+        for index in range(game.agents)
+    ]
     specs[agent] = Scripted("random")
     if run is None:
         env = make_env(game, seed=seed)
     else:
         env = replace(run, experiment=replace(run.experiment, game=game)).env(seed=seed)
+    about_others = ""
+    if other_agents.run is not None:
+        averages = averages_in_words(other_agents.run)
+        about_others = f"The others are of replica {other_agents.replica}. {averages}".rstrip()
     average_harvest_text = ""
     if run is not None and run is other_agents.run and steps is None:
         average_harvest_text = _average_harvest_text(run, agent)
@@ -259,7 +254,7 @@ def open_session(
         Population(env, specs, seed=seed).policy(1),
         agent=agent,
         decision=decision,
-        about_others=other_agents.in_words,
+        about_others=about_others,
         average_harvest_text=average_harvest_text,
     )
 

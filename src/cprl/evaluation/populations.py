@@ -93,27 +93,27 @@ def commons_game(run: LoadedRun) -> Game:
     return run.game
 
 
-Place: TypeAlias = LoadedRun | FreshGame
+WorldSource: TypeAlias = LoadedRun | FreshGame
 """The run or game that makes the fresh worlds in which agents play."""
 
 
-def place_of(where: Any) -> Place:
-    """Return a run as it is, and a game as a `FreshGame`."""
-    if isinstance(where, LoadedRun):
-        return where
-    if not is_playable(where):
-        raise refusal("where", where, "a game such as cprl.Game, or a value of cprl.load")
-    return FreshGame(instantiate(where))
+def world_source_of(game_or_run: Any) -> WorldSource:
+    """Return a run as it is, and a game as a `FreshGame`; refuse anything else."""
+    if isinstance(game_or_run, LoadedRun):
+        return game_or_run
+    if not is_playable(game_or_run):
+        raise refusal("game_or_run", game_or_run, "a game such as cprl.Game, or a value of cprl.load")
+    return FreshGame(instantiate(game_or_run))
 
 
-def fresh_for(runs: Iterable[LoadedRun], fresh: Fresh, *, among: Iterable[LoadedRun] = ()) -> Fresh:
+def fresh_for(runs: Iterable[LoadedRun], fresh: Fresh, *, other_runs: Iterable[LoadedRun] = ()) -> Fresh:
     """Return `fresh` with the replicas that play, after checking that the worlds are fresh for all agents.
 
     The replicas are those that `fresh` names, or by default all that every run has.
 
     Args:
         runs: the runs whose replicas play; none if all agents are scripted.
-        among: further runs with agents that play; their training seed must differ too.
+        other_runs: further runs with agents that play; their training seed must differ too.
 
     Raises:
         ValueError: if a run lacks one of the replicas, or was trained with the seed of `fresh`.
@@ -131,7 +131,7 @@ def fresh_for(runs: Iterable[LoadedRun], fresh: Fresh, *, among: Iterable[Loaded
         raise ValueError(
             f"the replicas of the runs are {replicas_by_run}; allowed: runs with a replica in common"
         )
-    refuse_trained_in(fresh.seed, [*runs, *among])
+    refuse_trained_in(fresh.seed, [*runs, *other_runs])
     return replace(fresh, replicas=tuple(sorted(set(fresh.replicas) or common)))
 
 
@@ -144,51 +144,53 @@ def refuse_trained_in(seed: int, runs: Iterable[LoadedRun]) -> None:
             )
 
 
-def fresh_worlds(fresh: Fresh, place: Place) -> Iterator[tuple[list[int], EnvBase]]:
+def fresh_worlds(fresh: Fresh, world_source: WorldSource) -> Iterator[tuple[list[int], EnvBase]]:
     """Yield groups of replicas with consecutive numbers, each with an environment that holds their worlds.
 
     The worlds of an environment have consecutive numbers, and are in the order of the replicas.
     """
     for group in consecutive_groups(fresh.replicas):
         first = group[0] * fresh.episodes
-        yield group, place.env(len(group) * fresh.episodes, seed=fresh.seed, first_world=first)
+        yield group, world_source.env(len(group) * fresh.episodes, seed=fresh.seed, first_world=first)
 
 
 def policies_of(
-    fresh: Fresh, place: Place, agents: Sequence[AgentOfReplica], replicas: Sequence[int]
+    fresh: Fresh, world_source: WorldSource, agents: Sequence[AgentOfReplica], replicas: Sequence[int]
 ) -> JointPolicy:
     """Return the joint policy of all agents in the lanes of these replicas."""
-    stored = [list(map(agent, replicas)) for agent in agents] + place.governor(replicas)
-    return stored_policies(stored, place.playing, replicas=replicas, worlds=fresh.episodes, seed=fresh.seed)
+    stored = [list(map(agent, replicas)) for agent in agents] + world_source.governor(replicas)
+    return stored_policies(
+        stored, world_source.playing, replicas=replicas, worlds=fresh.episodes, seed=fresh.seed
+    )
 
 
 def play_fresh(
     fresh: Fresh,
-    place: Place,
+    world_source: WorldSource,
     agents: Sequence[AgentOfReplica],
     labels: Label | None = None,
     *,
     roles: Sequence[str] = (),
-    among: Collection[LoadedRun] = (),
+    compared_runs: Collection[LoadedRun] = (),
 ) -> pa.Table:
     """Let a population play fresh episodes; return their table.
 
     Args:
         fresh: the episodes and the replicas, see `fresh_for`.
-        place: the run or the game that makes the worlds.
+        world_source: the run or the game that makes the worlds.
         agents: the agent at each index.
         labels: the values of the first columns, by the columns' names.
         roles: the role of each agent, see `cprl.measuring.table.ROLE` and `roles_of`.
-        among: all runs that are compared; the user's metrics that all of them have are measured. By default
-            those of `place`.
+        compared_runs: all runs that are compared; the user's metrics that all of them have are measured. By
+            default those of `world_source`.
     """
-    compared: Sequence[Place] = [*among] or [place]
+    compared: Sequence[WorldSource] = [*compared_runs] or [world_source]
     metrics = list(compared[0].metrics)
     for another in compared[1:]:
         metrics = [metric for metric in metrics if metric in another.metrics]
     parts = []
-    for group, env in fresh_worlds(fresh, place):
-        policies = policies_of(fresh, place, agents, group)
+    for group, env in fresh_worlds(fresh, world_source):
+        policies = policies_of(fresh, world_source, agents, group)
         ended = evaluate(env, policies, explore=not fresh.greedy, metrics=metrics)
         parts.append(table_of(ended, group))
     table = labelled(pa.concat_tables(parts), **(labels or {}))
@@ -246,19 +248,23 @@ def rotations(counts: Sequence[int]) -> list[tuple[int, ...]]:
     return [kinds[agents - shift :] + kinds[: agents - shift] for shift in range(agents)]
 
 
-def play_population(where: Any, agents: Sequence[AgentSpec], fresh: Fresh = Fresh()) -> pa.Table:
+def play_population(game_or_run: Any, agents: Sequence[AgentSpec], fresh: Fresh = Fresh()) -> pa.Table:
     """Let scripted and stored agents play fresh episodes, in which nobody learns; return their table.
 
     Args:
-        where: a game; or a run, a value of `cprl.load`, whose game and transforms are used.
+        game_or_run: a game; or a run, a value of `cprl.load`, whose game and transforms are used.
         agents: the specification of each agent, `Scripted`, `Language` or `Frozen`. In replica r,
             `Frozen(run, agent, replica=None)` is the agent of the run's replica r.
         fresh: the number of episodes, their seed, and the replicas that play. With the same seed all
             populations play in the same worlds.
+
+    Raises:
+        ValueError: for agents that learn, people, another number of agents than the game's, no replica in
+            common, or a seed with which a run was trained.
     """
-    place = place_of(where)
+    world_source = world_source_of(game_or_run)
     fresh = fresh_of_specs(agents, fresh)
-    return join_tables([play_fresh(fresh, place, agents_specified(place, agents, fresh))])
+    return join_tables([play_fresh(fresh, world_source, agents_specified(world_source, agents, fresh))])
 
 
 def fresh_of_specs(specs: Sequence[AgentSpec], fresh: Fresh) -> Fresh:
@@ -266,18 +272,20 @@ def fresh_of_specs(specs: Sequence[AgentSpec], fresh: Fresh) -> Fresh:
     frozen = [spec for spec in specs if isinstance(spec, Frozen)]
     runs = {spec.run: load(spec.run) for spec in frozen}
     runs_with_all_replicas = {spec.run: runs[spec.run] for spec in frozen if spec.replica is None}
-    return fresh_for(runs_with_all_replicas.values(), fresh, among=runs.values())
+    return fresh_for(runs_with_all_replicas.values(), fresh, other_runs=runs.values())
 
 
-def agents_specified(place: Place, specs: Sequence[AgentSpec], fresh: Fresh) -> list[AgentOfReplica]:
+def agents_specified(
+    world_source: WorldSource, specs: Sequence[AgentSpec], fresh: Fresh
+) -> list[AgentOfReplica]:
     """Return the agents that specifications describe; refuse those that learn, and people."""
-    for agent, spec in enumerate(specs_by_agent(specs, place.game.agents)):
+    for agent, spec in enumerate(specs_by_agent(specs, world_source.game.agents)):
         if not isinstance(spec, Scripted | Language | Frozen):
             allowed = "Scripted(policy), Language(model) or Frozen(run, agent, replica)"
             raise ValueError(f"agents[{agent}] is a {type(spec).__name__}; allowed: {allowed}")
-    agents_by_replica: list[dict[int, StoredAgent]] = [{} for _ in range(place.game.agents)]
+    agents_by_replica: list[dict[int, StoredAgent]] = [{} for _ in range(world_source.game.agents)]
     for group in consecutive_groups(fresh.replicas):
-        population = Population(place.env(len(group)), specs, first_replica=group[0])
+        population = Population(world_source.env(len(group)), specs, first_replica=group[0])
         for by_replica, agents in zip(agents_by_replica, population.as_stored(group), strict=True):
             by_replica |= zip(group, agents, strict=True)
     return [by_replica.__getitem__ for by_replica in agents_by_replica]
@@ -290,6 +298,9 @@ def agent_named(source: str, agent: int, *, replica: int | None = None, name: st
         source: the name of a scripted policy; or the directory of a run, whose agent with this index plays.
         replica: the replica of the run; None for the same as the one that plays.
         name: the name of the argument, for a refusal.
+
+    Raises:
+        ValueError: for a word that is neither.
     """
     if source in SCRIPTED_POLICIES:
         return Scripted(source)

@@ -197,6 +197,11 @@ def run_scenarios(
         A table with a row for each scenario, focal agents, placement, replica, episode and agent, see
         `cprl.measuring.table`. The column "scenario" has the scenario's name, "focal" says "run", "random" or
         "greedy", and "focal_agents" has the indices of the focal agents, e.g. "0 2 3".
+
+    Raises:
+        ValueError: for a game that scripted agents cannot play, an unknown scenario, one of another game or
+            given twice, background agents that were trained with the run's agents, or a seed with which a run
+            was trained.
     """
     loaded = as_loaded(run)
     check_game(loaded.game)
@@ -204,7 +209,7 @@ def run_scenarios(
     check_scripted([(Scripted("greedy"), tuple(range(count)))], loaded.spaces, loaded.game)
     chosen = _choose_scenarios(loaded, scenarios)
     background_runs = _load_background_runs(loaded, chosen)
-    fresh = fresh_for([loaded], fresh, among=background_runs.values())
+    fresh = fresh_for([loaded], fresh, other_runs=background_runs.values())
 
     backgrounds = {}
     for scenario in chosen:

@@ -100,7 +100,9 @@ def play_empirical_game(runs: Runs, fresh: Fresh = Fresh(episodes=5)) -> pa.Tabl
             roles = [names[run] for run in choice]
             labels = {COMPOSITION: composition_text(counts, names), "runs": " ".join(roles)}
             parts.append(
-                play_fresh(fresh, by_name[roles[0]], mixed, labels, roles=roles, among=by_name.values())
+                play_fresh(
+                    fresh, by_name[roles[0]], mixed, labels, roles=roles, compared_runs=by_name.values()
+                )
             )
     title = heading("Empirical game", fresh, by_name.values(), _EACH)
     return join_tables(parts, heading=title, fresh=fresh)

@@ -64,18 +64,23 @@ def export_turns(
     how much that is.
 
     Args:
+        run: the run's directory.
         out: of "csv", the file: a row for each episode, turn and agent, turns counted from 1, see `Exported`.
             Of "minari" a directory of Minari data sets, one for each agent: `<name of out>/agent_0-v0` and so
             on, which `minari.load_dataset` finds where the environment variable MINARI_DATASETS_PATH is the
             directory that `out` lies in. Actions and rewards of all agents are in the infos of each, as
             "joint_action" and "joint_reward".
-        episodes: which are those of `cprl film` with the same replica and seed, from 0 on.
+        format: "csv", or "minari" with the package of this name.
+        episodes: the number of episodes: those of `cprl film` with the same replica and seed, from 0 on.
+        replica: the number of the replica.
+        seed: the seed of the worlds and of all random choices.
 
     Returns:
         What was written.
 
     Raises:
         FileExistsError: if any of it exists.
+        ValueError: for an unknown format, a replica that the run lacks, or a seed with which it was trained.
         ModuleNotFoundError: for "minari" without that package.
     """
     format = checked("format", format, Format)
@@ -90,8 +95,8 @@ def export_turns(
     def played() -> Iterator[Exported]:
         for episode in range(episodes):
             note_progress(episode, episodes, "episodes")
-            (fresh,) = fresh_episodes([loaded], replica=replica, episode=episode, seed=seed)
-            yield _exported(loaded.game, record(fresh))
+            (fresh_episode,) = fresh_episodes([loaded], replica=replica, episode=episode, seed=seed)
+            yield _exported(loaded.game, record(fresh_episode))
 
     target.parent.mkdir(parents=True, exist_ok=True)
     if format == "csv":
@@ -140,14 +145,14 @@ def _write_csv(path: Path, played: Iterable[Exported]) -> list[Path]:
         nonlocal count
         text = io.TextIOWrapper(file, encoding="utf-8", newline="")
         table = csv.writer(text)
-        for episode, one in enumerate(played):
-            if not episode:
-                table.writerow((*_INDICES, *one.columns))
-            turn, agent = (np.asarray(index) for index in np.indices(one.action.shape))
-            indices = (np.full_like(turn, episode), turn + 1, agent)
-            columns = [_plain(values) for values in (*indices, *one.columns.values())]
+        for number, episode in enumerate(played):
+            if number == 0:
+                table.writerow((*_INDICES, *episode.columns))
+            turn, agent = (np.asarray(index) for index in np.indices(episode.action.shape))
+            indices = (np.full_like(turn, number), turn + 1, agent)
+            columns = [_plain(values) for values in (*indices, *episode.columns.values())]
             table.writerows(zip(*columns, strict=True))
-            count += one.action.size
+            count += episode.action.size
         text.flush()
         text.detach()  # the file is closed by who opened it
 

@@ -37,11 +37,11 @@ from cprl.evaluation.populations import (
     agents_specified,
     fresh_of_specs,
     join_tables,
-    place_of,
     play_fresh,
     roles_of,
     rotations,
     table_note,
+    world_source_of,
 )
 from cprl.measuring.registry import INCOME
 from cprl.measuring.statistics import Estimate, Family, difference, estimate
@@ -181,7 +181,7 @@ def _signs(margin: Estimate) -> Iterator[bool]:
 
 @working("playing mixes")
 def schelling(
-    where: Any,
+    game_or_run: Any,
     fresh: Fresh = Fresh(episodes=5),
     *,
     restrained: str = "sustainable",
@@ -190,7 +190,7 @@ def schelling(
     """Play all mixes of cooperators and defectors: N (N - 1) + 2 populations of N agents.
 
     Args:
-        where: a game, or a run, a value of `cprl.load`, whose game and transforms are used.
+        game_or_run: a game, or a run, a value of `cprl.load`, whose game and transforms are used.
         fresh: which episodes, with each choice of restrained agents; all mixes play in the same worlds.
         restrained: who plays restrained: a scripted policy, or the directory of a run, of whose replica r
             the agent of the same index plays in replica r.
@@ -200,22 +200,22 @@ def schelling(
         A row for each mix, replica, episode and agent, see `cprl.measuring.table`, by "restrained", the
         indices of the restrained agents, who are focal, e.g. "0 1", and "restrained_agents", their number.
     """
-    place = place_of(where)
-    agents = place.game.agents
+    world_source = world_source_of(game_or_run)
+    agents = world_source.game.agents
     if agents < 2:
         raise ValueError("the game has 1 agent; allowed for a Schelling diagram: at least 2")
-    _refuse_alike(place.game, restrained, greedy)
+    _refuse_alike(world_source.game, restrained, greedy)
     cooperators = [agent_named(restrained, agent, name="restrained") for agent in range(agents)]
     defectors = [agent_named(greedy, agent, name="greedy") for agent in range(agents)]
     fresh = fresh_of_specs([*cooperators, *defectors], fresh)
-    kinds = [agents_specified(place, kind, fresh) for kind in (cooperators, defectors)]
+    kinds = [agents_specified(world_source, kind, fresh) for kind in (cooperators, defectors)]
 
     def parts(count: int) -> Iterator[pa.Table]:
         for kind_of_agent in rotations((count, agents - count)):
             focal = tuple(agent for agent, kind in enumerate(kind_of_agent) if kind == 0)
             mix = [kinds[kind][agent] for agent, kind in enumerate(kind_of_agent)]
             labels: Label = {"restrained": " ".join(map(str, focal)), _MIX: count}
-            yield play_fresh(fresh, place, mix, labels, roles=roles_of(agents, focal))
+            yield play_fresh(fresh, world_source, mix, labels, roles=roles_of(agents, focal))
 
     return join_tables(
         (part for count in range(agents + 1) for part in parts(count)),

@@ -4,9 +4,10 @@ A game carries institutions as values: `Game(..., institutions=(Quota(share=0.8)
 of institution has a module, with four parts:
 
 - the value, a dataclass such as `Quota`, with the settings that a user chooses;
-- `Arrays`, a named tuple with its parameters, and with what it remembers in each of B worlds;
-- `parameters(game)`, which returns the parameters among `Arrays`; a module without it takes them from the
-  fields of the value;
+- its arrays, a named tuple such as `QuotaArrays` with its parameters, and with what it remembers in each of B
+  worlds;
+- `parameters(game)`, which returns the parameters among its arrays by name; a module without it takes them
+  from the fields of the value;
 - its rules, functions that `hooks` calls at fixed moments of a turn, and that Numba compiles.
 
 Modules in reading order:
@@ -32,60 +33,62 @@ Modules in reading order:
     law          joins the institutions of a game: their parameters, arrays and checks
 """
 
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
-from cprl.institutions import (
-    boundaries,
-    mediation,
-    monitoring,
-    patches,
-    punishment,
-    quotas,
-    rotation,
-    sanctioner,
-    sanctions,
-    seasons,
-    taxes,
-    votes,
-)
-from cprl.institutions.boundaries import Boundaries
+from cprl.institutions.boundaries import Boundaries, BoundaryArrays
 from cprl.institutions.governor import Governor
 from cprl.institutions.institution import Institution
-from cprl.institutions.ledger import COUNT_NAMES, Entries, Ledger
-from cprl.institutions.mediation import Mediation
-from cprl.institutions.monitoring import Monitoring
-from cprl.institutions.patches import ClosedPatches
-from cprl.institutions.punishment import Punishment
-from cprl.institutions.quotas import Quota
-from cprl.institutions.rotation import Rotation
-from cprl.institutions.sanctioner import Sanctioner
-from cprl.institutions.sanctions import GraduatedSanctions
-from cprl.institutions.seasons import ClosedSeason
-from cprl.institutions.taxes import Levies, Tax
-from cprl.institutions.votes import Vote
+from cprl.institutions.ledger import COUNT_NAMES, Ledger
+from cprl.institutions.mediation import Mediation, MediationArrays
+from cprl.institutions.monitoring import Monitoring, MonitoringArrays
+from cprl.institutions.patches import ClosedPatches, PatchArrays
+from cprl.institutions.punishment import Punishment, PunishmentArrays
+from cprl.institutions.quotas import Quota, QuotaArrays
+from cprl.institutions.rotation import Rotation, RotationArrays
+from cprl.institutions.sanctioner import Sanctioner, SanctionerArrays
+from cprl.institutions.sanctions import GraduatedSanctions, SanctionArrays
+from cprl.institutions.seasons import ClosedSeason, SeasonArrays
+from cprl.institutions.taxes import Levies, Tax, TaxArrays
+from cprl.institutions.votes import BallotArrays, Vote
+from cprl.values.array_types import Int32
+
+
+class Entries(NamedTuple):
+    """The numbers that institutions show agents, one per index of axis E."""
+
+    module: Annotated[Int32, "E"]
+    """The index of the module among the fields of `Law`."""
+    entry: Annotated[Int32, "E"]
+    """The index of the number in the `entries` of its institution's class."""
+    argument: Annotated[Int32, "E"]
+    """The index of what the number is about: an institution of its kind, a ballot, or an agent."""
+    shows_places: bool
+    """Whether agents see the cells where they may not harvest."""
+    first_plane: int
+    """The index of the first channel of institutions in observations."""
 
 
 class Law(NamedTuple):
     """The arrays of all institutions for B worlds.
 
-    First come the arrays that institutions share, then the `Arrays` of each module, in the order in which
-    their rules are called.
+    First come the arrays that institutions share, then those of each module, in the order in which their
+    rules are called.
     """
 
     ledger: Ledger
     entries: Entries
-    boundaries: boundaries.Arrays
-    seasons: seasons.Arrays
-    quotas: quotas.Arrays
-    patches: patches.Arrays
-    rotation: rotation.Arrays
-    monitoring: monitoring.Arrays
-    taxes: taxes.Arrays
-    votes: votes.Arrays
-    sanctions: sanctions.Arrays
-    mediation: mediation.Arrays
-    punishment: punishment.Arrays
-    sanctioner: sanctioner.Arrays
+    boundaries: BoundaryArrays
+    seasons: SeasonArrays
+    quotas: QuotaArrays
+    patches: PatchArrays
+    rotation: RotationArrays
+    monitoring: MonitoringArrays
+    taxes: TaxArrays
+    votes: BallotArrays
+    sanctions: SanctionArrays
+    mediation: MediationArrays
+    punishment: PunishmentArrays
+    sanctioner: SanctionerArrays
 
 
 __all__ = [

@@ -189,5 +189,5 @@ def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
 
 
 def _tuple_in(field: Any) -> type[Any] | None:
-    """Return the class of named tuples in an annotation such as `Arrays` or `Arrays | None`; None without."""
+    """Return the class of named tuples in an annotation, e.g. `RiverArrays | None`; None without one."""
     return next(filter(is_record, (field, *get_args(field))), None)

@@ -1,13 +1,14 @@
 """Boundaries: regions of the board with owners."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from string import ascii_lowercase, digits
 from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
-from cprl.institutions.institution import Amount, Institution, columns, with_ballots
-from cprl.institutions.ledger import OWN_BITES, TRESPASSES, Ledger, violate
+from cprl.institutions.institution import Amount, Institution, field_values, with_ballots
+from cprl.institutions.ledger import OWN_BITES, TRESPASSES, Ledger, note_violation
 from cprl.values import Where, short_repr
 from cprl.values.array_types import Bool, Float64
 
@@ -47,12 +48,12 @@ class Boundaries(Institution):
     other sign names a region."""
 
     owners: Owners | None = None
-    """The signs of the regions that each agent may use, e.g. ("a", "a", "ab") for three agents. None lets
-    agent i use the region of its own sign: "0" to "9", then "a" to "z"."""
+    """The signs of the regions that each agent may use, e.g. ("a", "a", "ab") for three agents: each sign of
+    a text is a region. None lets agent i use the region of its own sign: "0" to "9", then "a" to "z"."""
 
     bite_fine: Amount | None = None
-    """The fine in apples for a harvest in a region of others, which is a violation, if it is detected. None
-    makes such a harvest impossible."""
+    """The fine in apples for a harvest (a bite) in a region of others, which is a violation, if it is
+    detected. None makes such a harvest impossible."""
 
     step_fine: Amount | None = None
     """The fine in apples for a turn that ends in a region of others, which is a violation, if it is detected.
@@ -65,7 +66,12 @@ class Boundaries(Institution):
     def drawn(cls, drawing: str, **fields: Any) -> "Boundaries":
         """Return boundaries from a drawing, with a line for each row of the board.
 
-        Spaces around lines and empty lines are ignored. `fields`: the other fields, e.g. `bite_fine=1.0`.
+        Args:
+            drawing: the text; spaces around lines and empty lines are ignored.
+            fields: the other fields, e.g. `bite_fine=1.0`.
+
+        Raises:
+            ValueError: for lines of different lengths, or fields that `Boundaries` refuses.
         """
         lines = [line.strip() for line in str(drawing).splitlines()]
         return cls(regions=tuple(line for line in lines if line), **fields)
@@ -74,7 +80,16 @@ class Boundaries(Institution):
     def strips(cls, *, height: int, width: int, agents: int, **fields: Any) -> "Boundaries":
         """Return a board's division into vertical strips, one per agent from left to right.
 
-        The widths of the strips differ by at most one column. `fields`: the other fields.
+        The widths of the strips differ by at most one column.
+
+        Args:
+            height: the number of rows H of the board.
+            width: the number of columns W of the board.
+            agents: the number of agents N.
+            fields: the other fields.
+
+        Raises:
+            ValueError: for more agents than columns or signs, or fields that `Boundaries` refuses.
         """
         if not 1 <= agents <= min(width, len(AGENT_SIGNS)):
             raise ValueError(f"agents is {agents}; allowed: 1 to {min(width, len(AGENT_SIGNS))}")
@@ -95,7 +110,6 @@ class Boundaries(Institution):
         return self.bite_fine is not None or self.regions[row][col] in OPEN + self.signs_of(agent)
 
     def check(self, game: Any) -> None:
-        agents = game.agents
         height = len(self.regions)
         width = len(self.regions[0])
         if (height, width) != (game.map.height, game.map.width):
@@ -103,10 +117,14 @@ class Boundaries(Institution):
                 f"Boundaries.regions is {height} x {width}; allowed: {game.map.height} x "
                 f"{game.map.width}, as the map"
             )
-        if self.owners is not None and len(self.owners) != agents:
+        if self.owners is not None and len(self.owners) != game.agents:
             raise ValueError(
-                f"Boundaries.owners has {len(self.owners)} entries; allowed: {agents}, one per agent"
+                f"Boundaries.owners has {len(self.owners)} entries; allowed: {game.agents}, one per agent"
             )
+        self._check_signs(game.agents)
+
+    def _check_signs(self, agents: int) -> None:
+        """Refuse a sign of a region that no agent may use."""
         known_signs = {sign for agent in range(agents) for sign in self.signs_of(agent)}
         for row, line in enumerate(self.regions):
             for col, sign in enumerate(line):
@@ -117,7 +135,7 @@ class Boundaries(Institution):
                     )
 
 
-class Arrays(NamedTuple):
+class BoundaryArrays(NamedTuple):
     """The parameters of all `Boundaries` of a game, one of them per index of axis R."""
 
     may_use: Annotated[Bool, "R N cells"]
@@ -125,56 +143,62 @@ class Arrays(NamedTuple):
     is_stopped: Annotated[Bool, "R"]
     """True if harvests in regions of others are impossible."""
     fine: Annotated[Float64, "R"]
-    """`Boundaries.bite_fine`, 0 for None."""
+    """`Boundaries.bite_fine`, 0 for None; the name is that of `cprl.institutions.hooks.Limits`."""
     step_is_violation: Annotated[Bool, "R"]
     step_fine: Annotated[Float64, "R"]
     observed: Annotated[Bool, "R"]
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
+    """Return the parameters in `BoundaryArrays` by name."""
     boundaries = [boundary for boundary, _ in with_ballots(game, Boundaries)]
-    tables = game.tables
-    cells = tables.background.size
-    may_use = np.ones((len(boundaries), game.agents, cells // tables.stride, tables.stride), np.bool_)
-    board_cells = may_use[:, :, tables.rim : -tables.rim, tables.rim : -tables.rim]
-    for index, boundary in enumerate(boundaries):
-        signs = np.array([list(row) for row in boundary.regions])
-        for agent in range(game.agents):
-            board_cells[index, agent] = np.isin(signs, [OPEN, *boundary.signs_of(agent)])
     return {
-        "may_use": may_use.reshape(len(boundaries), game.agents, cells),
+        "may_use": _may_use(boundaries, game),
         "is_stopped": [boundary.bite_fine is None for boundary in boundaries],
         "fine": [boundary.bite_fine or 0.0 for boundary in boundaries],
         "step_is_violation": [boundary.step_fine is not None for boundary in boundaries],
-        **columns(Boundaries, Arrays, game),
+        **field_values(Boundaries, BoundaryArrays, game),
     }
 
 
-def is_foreign(boundaries: Arrays, r: int, i: int, cell: int) -> bool:
-    """Return whether a cell is in a region of others for agent i, by boundaries r."""
-    return not boundaries.may_use[r, i, cell]
+def _may_use(boundaries: Sequence[Boundaries], game: Any) -> Bool:
+    """Return the cells that each agent may use, bool [R, N, cells]."""
+    tables = game.tables
+    rows = tables.background.size // tables.stride
+    may_use = np.ones((len(boundaries), game.agents, rows, tables.stride), np.bool_)
+    # Cells are those of the board and of a rim of walls around it. Nobody harvests there, so it stays True.
+    on_board = may_use[:, :, tables.rim : -tables.rim, tables.rim : -tables.rim]
+    for rule, boundary in enumerate(boundaries):
+        signs = np.array([list(row) for row in boundary.regions])
+        for agent in range(game.agents):
+            on_board[rule, agent] = np.isin(signs, [OPEN, *boundary.signs_of(agent)])
+    return may_use.reshape(len(boundaries), game.agents, tables.background.size)
 
 
-def count_own_harvest(boundaries: Arrays, ledger: Ledger, i: int, cell: int) -> None:
-    """Count a harvest of agent i, if it is on a cell that it may use."""
-    for r in range(boundaries.fine.shape[0]):
-        ledger.counts[i, OWN_BITES] += boundaries.may_use[r, i, cell]
+def is_foreign(boundaries: BoundaryArrays, rule: int, agent: int, cell: int) -> bool:
+    """Return whether a cell is in a region of others for an agent; `rule`: the index of the `Boundaries`."""
+    return not boundaries.may_use[rule, agent, cell]
 
 
-def note_trespass(boundaries: Arrays, ledger: Ledger, i: int, cell: int) -> None:
-    """Count a trespass of agent i if it ends its move in a region of others; it may be a violation."""
-    for r in range(boundaries.step_fine.shape[0]):
-        if is_foreign(boundaries, r, i, cell):
-            if boundaries.step_is_violation[r]:
-                violate(ledger, i, TRESPASSES, boundaries.step_fine[r])
+def count_own_harvest(boundaries: BoundaryArrays, ledger: Ledger, agent: int, cell: int) -> None:
+    """Count a harvest of an agent once for each of the `Boundaries` by which it may use the cell."""
+    for rule in range(boundaries.fine.shape[0]):
+        ledger.counts[agent, OWN_BITES] += boundaries.may_use[rule, agent, cell]
+
+
+def note_trespass(boundaries: BoundaryArrays, ledger: Ledger, agent: int, cell: int) -> None:
+    """Count a trespass of an agent if it ends its move in a region of others; it may be a violation."""
+    for rule in range(boundaries.step_fine.shape[0]):
+        if is_foreign(boundaries, rule, agent, cell):
+            if boundaries.step_is_violation[rule]:
+                note_violation(ledger, agent, TRESPASSES, boundaries.step_fine[rule])
             else:
-                ledger.counts[i, TRESPASSES] += 1
+                ledger.counts[agent, TRESPASSES] += 1
 
 
-def shows_foreign(boundaries: Arrays, i: int, cell: int) -> bool:
-    """Return whether agents observe that agent i may not use a cell."""
-    for r in range(boundaries.observed.shape[0]):
-        if boundaries.observed[r] and is_foreign(boundaries, r, i, cell):
+def is_seen_as_foreign(boundaries: BoundaryArrays, agent: int, cell: int) -> bool:
+    """Return whether agents observe that an agent may not use a cell."""
+    for rule in range(boundaries.observed.shape[0]):
+        if boundaries.observed[rule] and is_foreign(boundaries, rule, agent, cell):
             return True
     return False

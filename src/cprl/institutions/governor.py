@@ -76,9 +76,9 @@ class Governor(Institution):
     """The share of all sites below which the stock must not fall: the objective of a period that ends below
     it is 0."""
 
-    at_most: ClassVar[int | None] = 1
+    most_in_game: ClassVar[int | None] = 1
 
-    def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
+    def shown_entries(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
         return [("in force", ballot)]
 
     def governed(self, game: Any) -> Institution | None:

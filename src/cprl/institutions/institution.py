@@ -44,9 +44,9 @@ class Institution(Value, stored=False):
     """Whether agents observe the entries and places that this institution can show them, see
     `cprl.commons.views`."""
 
-    at_most: ClassVar[int | None] = None
+    most_in_game: ClassVar[int | None] = None
     """The largest number of institutions of this kind in a game; None for any number."""
-    needs: ClassVar[tuple[str, ...]] = ()
+    needed_switches: ClassVar[tuple[str, ...]] = ()
     """The switches of `Observation` that must be on for agents to understand what this institution shows."""
     shows_places: ClassVar[bool] = False
     """Whether it shows agents the cells where they may not harvest."""
@@ -77,7 +77,7 @@ class Institution(Value, stored=False):
         """Return the ballot by which N agents decide about it; None if they do not."""
         return None
 
-    def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
+    def shown_entries(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
         """Return the (entry, argument) pairs that it shows agents, with entries out of `entries`.
 
         Args:
@@ -131,15 +131,15 @@ def with_ballots(game: Any, kind: type[Kind]) -> list[tuple[Kind, int]]:
     """
     return [
         (institution.rule, ballot)
-        for institution, ballot in numbered(game)
+        for institution, ballot in with_ballot_index(game)
         if isinstance(institution.rule, kind)
     ]
 
 
-def columns(kind: type[Kind], arrays: Any, game: Any) -> dict[str, Any]:
+def field_values(kind: type[Kind], arrays: Any, game: Any) -> dict[str, Any]:
     """Return the parameters that a module takes from the fields of its institutions.
 
-    Each entry of `arrays`, the class `Arrays` of the module, that is named like a field of `kind` gets a list
+    Each entry of `arrays`, the class of the module's arrays, that is named like a field of `kind` gets a list
     with the value of that field in each institution of the game, 0 for None. The entry "ballot" gets the
     indices of their ballots, or -1.
     """
@@ -151,7 +151,7 @@ def columns(kind: type[Kind], arrays: Any, game: Any) -> dict[str, Any]:
     return entries
 
 
-def numbered(game: Any) -> Iterator[tuple[Institution, int]]:
+def with_ballot_index(game: Any) -> Iterator[tuple[Institution, int]]:
     """Yield the institutions of a game, each with the index in `Game.in_force` of what is decided about it,
     or -1. What a governor sets comes after all ballots."""
     ballots = 0

@@ -6,17 +6,17 @@
 from importlib import import_module
 from typing import Any, Final, cast
 
-from cprl.institutions import Law
+from cprl.institutions import Entries, Law
 from cprl.institutions.arrays import filled
 from cprl.institutions.governor import Governor
-from cprl.institutions.institution import Institution, columns, numbered
+from cprl.institutions.institution import Institution, field_values, with_ballot_index
 from cprl.institutions.ledger import COUNT_NAMES, Ledger
 from cprl.institutions.votes import MOST_DECISIONS
 
 MODULES: Final = {
     name: import_module(kind.__module__)
     for name, kind in Law.__annotations__.items()
-    if kind.__name__ == "Arrays"
+    if kind not in (Ledger, Entries)
 }
 """The modules of institutions by their fields in `Law`, which have the names of the modules."""
 
@@ -37,12 +37,12 @@ def entries_shown(game: Any) -> list[tuple[str, int]]:
     """Return the (entry, argument) pairs that the institutions of a game show agents, in their order."""
     entries: list[tuple[str, int]] = []
     earlier_of_kind = dict.fromkeys(INSTITUTION_KINDS, 0)
-    for institution, ballot in numbered(game):
+    for institution, ballot in with_ballot_index(game):
         # A vote shows its result, and the institution that is voted on shows its own entries.
         for rule in dict.fromkeys((institution, institution.rule)):
             if rule.observed:
                 index_in_kind = earlier_of_kind[type(rule)]
-                entries += rule.shows(number=index_in_kind, ballot=ballot, agents=game.agents)
+                entries += rule.shown_entries(number=index_in_kind, ballot=ballot, agents=game.agents)
             earlier_of_kind[type(rule)] += 1
     return entries
 
@@ -57,21 +57,22 @@ def parameters(game: Any) -> dict[str, dict[str, Any]]:
     shown_entries = entries_shown(game)
     entries = {
         "module": [module_and_index[entry][0] for entry, _ in shown_entries],
-        "what": [module_and_index[entry][1] for entry, _ in shown_entries],
+        "entry": [module_and_index[entry][1] for entry, _ in shown_entries],
         "argument": [argument for _, argument in shown_entries],
-        "places": shows_places(game),
+        "shows_places": shows_places(game),
         "first_plane": len(game.game_channels),
     }
-    return {"entries": entries} | {name: _parameters(module, game) for name, module in MODULES.items()}
+    return {"entries": entries} | {name: _parameters(name, game) for name in MODULES}
 
 
-def _parameters(module: Any, game: Any) -> dict[str, Any]:
+def _parameters(name: str, game: Any) -> dict[str, Any]:
     """Return the parameters of one module: those of its function `parameters`, or else the fields of its
     institutions in the game."""
+    module: Any = MODULES[name]
     if hasattr(module, "parameters"):
         return module.parameters(game)
     (kind,) = (kind for kind in INSTITUTION_KINDS if kind.__module__ == module.__name__)
-    return columns(kind, module.Arrays, game)
+    return field_values(kind, Law.__annotations__[name], game)
 
 
 def new_law(game: Any, worlds: int) -> Law:
@@ -110,14 +111,16 @@ def _check_kind(institution: Institution, game: Any) -> None:
             "a TorchRL transform, see docs/institutions.md"
         )
     count = sum(type(other) is kind for other in game.institutions)
-    if kind.at_most is not None and count > kind.at_most:
-        raise ValueError(f"Game.institutions has {count} of {kind.__name__}; allowed: at most {kind.at_most}")
+    if kind.most_in_game is not None and count > kind.most_in_game:
+        raise ValueError(
+            f"Game.institutions has {count} of {kind.__name__}; allowed: at most {kind.most_in_game}"
+        )
 
 
 def _check_needs(institution: Institution, game: Any) -> None:
     """Refuse an institution in a game without the observations or beams that it needs."""
     kind = type(institution)
-    for switch in kind.needs:
+    for switch in kind.needed_switches:
         if institution.observed and not getattr(game.observation, switch):
             raise ValueError(
                 f"{kind.__name__}.observed is True and Observation.{switch} is False; allowed: "

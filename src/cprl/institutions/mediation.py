@@ -28,8 +28,8 @@ class Mediation(Institution):
     """The apples that the tagged agent receives."""
 
     entries: ClassVar[tuple[str, ...]] = ("violator",)
-    at_most: ClassVar[int | None] = 1
-    needs: ClassVar[tuple[str, ...]] = ("agents_apart",)
+    most_in_game: ClassVar[int | None] = 1
+    needed_switches: ClassVar[tuple[str, ...]] = ("agents_apart",)
     counts: ClassVar[tuple[str, ...]] = ("unjust_tags",)
 
     @property
@@ -40,46 +40,46 @@ class Mediation(Institution):
     def needs_tags(self) -> bool:
         return True
 
-    def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
+    def shown_entries(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
         return [("violator", agent) for agent in range(agents)]
 
 
-class Arrays(NamedTuple):
+class MediationArrays(NamedTuple):
     """The parameters of a game's `Mediation`; axis M has length 1, or 0 without it."""
 
     turns: Annotated[Int32, "M"]
     refund: Annotated[Float64, "M"]
 
 
-def mediate(mediation: Arrays, ledger: Ledger, tagged_by: Bool, turn: int) -> None:
+def mediate(mediation: MediationArrays, ledger: Ledger, tagged_by: Bool, turn: int) -> None:
     """Refund all agents that were tagged unjustly; `tagged_by`: bool [N, N], agent tagged, shooter."""
     if mediation.turns.shape[0] > 0:
-        for i in range(tagged_by.shape[0]):
-            refund_tag(mediation, ledger, tagged_by, i, turn)
+        for agent in range(tagged_by.shape[0]):
+            refund_tag(mediation, ledger, tagged_by, agent, turn)
 
 
-def refund_tag(mediation: Arrays, ledger: Ledger, tagged_by: Bool, i: int, turn: int) -> None:
-    """Refund agent i if it was tagged and broke no rule, and let the shooters pay in equal parts."""
+def refund_tag(mediation: MediationArrays, ledger: Ledger, tagged_by: Bool, agent: int, turn: int) -> None:
+    """Refund an agent if it was tagged and broke no rule, and let the shooters pay in equal parts."""
     shooters = 0
-    for j in range(tagged_by.shape[0]):
-        shooters += tagged_by[i, j]
-    if shooters == 0 or ledger.broke[i] or has_mark(mediation, ledger, i, turn):
+    for shooter in range(tagged_by.shape[0]):
+        shooters += tagged_by[agent, shooter]
+    if shooters == 0 or ledger.has_violated[agent] or has_mark(mediation, ledger, agent, turn):
         return
-    ledger.transfers[i] += mediation.refund[0]
-    for j in range(tagged_by.shape[0]):
-        if tagged_by[i, j]:
-            ledger.fines[j] += mediation.refund[0] / shooters
-            ledger.counts[j, UNJUST_TAGS] += 1
-            ledger.unjust[j] = True
+    ledger.transfers[agent] += mediation.refund[0]
+    for shooter in range(tagged_by.shape[0]):
+        if tagged_by[agent, shooter]:
+            ledger.fines[shooter] += mediation.refund[0] / shooters
+            ledger.counts[shooter, UNJUST_TAGS] += 1
+            ledger.has_tagged_unjustly[shooter] = True
 
 
-def has_mark(mediation: Arrays, ledger: Ledger, i: int, turn: int) -> bool:
-    """Return whether agent i violated a rule so few turns before this one that a tag in it is just."""
-    return ledger.violation_step[i] > 0 and turn - ledger.violation_step[i] < mediation.turns[0]
+def has_mark(mediation: MediationArrays, ledger: Ledger, agent: int, turn: int) -> bool:
+    """Return whether an agent violated a rule so few turns before this one that a tag in it is just."""
+    return ledger.violation_step[agent] > 0 and turn - ledger.violation_step[agent] < mediation.turns[0]
 
 
-def show_mark(mediation: Arrays, ledger: Ledger, offset: int, i: int, turn: int) -> float:
-    """Return what agent i observes of the agent `offset` indices after it: 1 if that violated a rule in the
+def show_mark(mediation: MediationArrays, ledger: Ledger, offset: int, observer: int, turn: int) -> float:
+    """Return what an observer sees of the agent `offset` indices after it: 1 if that violated a rule in the
     last turns, else 0."""
-    agent = (i + offset) % ledger.fines.shape[0]
+    agent = (observer + offset) % ledger.fines.shape[0]
     return 1.0 if has_mark(mediation, ledger, agent, turn + 1) else 0.0

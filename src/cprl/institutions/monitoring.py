@@ -44,7 +44,7 @@ class Monitoring(Institution):
     """The number of episodes from one election to the next; the first one is in the first episode."""
 
     entries: ClassVar[tuple[str, ...]] = ("detected", "elected")
-    at_most: ClassVar[int | None] = 1
+    most_in_game: ClassVar[int | None] = 1
     counts: ClassVar[tuple[str, ...]] = ("detections",)
 
     def __post_init__(self) -> None:
@@ -62,7 +62,7 @@ class Monitoring(Institution):
             period_episodes=self.period_episodes,
         )
 
-    def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
+    def shown_entries(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
         return [("detected", 0), *([("elected", ballot)] if self.monitor == ELECTED else [])]
 
     def check(self, game: Any) -> None:
@@ -74,7 +74,7 @@ class Monitoring(Institution):
             )
 
 
-class Arrays(NamedTuple):
+class MonitoringArrays(NamedTuple):
     """The parameters of the detection of violations, in any game."""
 
     detected_below: int
@@ -87,14 +87,14 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name; without `Monitoring` every violation is detected."""
+    """Return the parameters in `MonitoringArrays`; without `Monitoring` every violation is detected."""
     monitoring, ballot = next(iter(with_ballots(game, Monitoring)), (Monitoring(prob=1.0), -1))
     payer = monitoring.monitor if isinstance(monitoring.monitor, int) else -1
     below = threshold(monitoring.prob)
     return {"detected_below": below, "cost": monitoring.cost, "payer": payer, "ballot": ballot}
 
 
-def charge_inspection(monitoring: Arrays, ledger: Ledger) -> None:
+def charge_inspection(monitoring: MonitoringArrays, ledger: Ledger) -> None:
     """Let the agent that monitors, or all agents in equal parts, pay the cost of inspection."""
     if monitoring.cost == 0:
         return
@@ -102,19 +102,21 @@ def charge_inspection(monitoring: Arrays, ledger: Ledger) -> None:
     payer = monitoring.payer
     if monitoring.ballot >= 0:
         payer = int(ledger.in_force[monitoring.ballot])
-    for i in range(agents):
-        if payer == i:
-            ledger.fines[i] += monitoring.cost
+    for agent in range(agents):
+        if payer == agent:
+            ledger.fines[agent] += monitoring.cost
         elif payer < 0:
-            ledger.fines[i] += monitoring.cost / agents
+            ledger.fines[agent] += monitoring.cost / agents
 
 
-def show_monitoring(monitoring: Arrays, ledger: Ledger, what: int, ballot: int, i: int) -> float:
-    """Return what agent i observes of monitoring after a turn, 0 or 1.
+def show_monitoring(
+    monitoring: MonitoringArrays, ledger: Ledger, entry: int, ballot: int, agent: int
+) -> float:
+    """Return what an agent observes of monitoring after a turn, 0 or 1.
 
-    Entry 0 is 1 if a violation of agent i was detected in the turn; entry 1 is 1 if it is the elected
-    monitor. `what`: the index of the entry.
+    Entry 0 is 1 if a violation of the agent was detected in the turn; entry 1 is 1 if it is the elected
+    monitor. `entry`: its index.
     """
-    if what == 0:
-        return 1.0 if ledger.detected[i] else 0.0
-    return 1.0 if ledger.in_force[ballot] == i else 0.0
+    if entry == 0:
+        return 1.0 if ledger.detected[agent] else 0.0
+    return 1.0 if ledger.in_force[ballot] == agent else 0.0

@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import numpy as np
 
 from cprl.institutions.arrays import DERIVED
-from cprl.institutions.institution import Amount, Limit, columns, with_ballots
+from cprl.institutions.institution import Amount, Limit, field_values, with_ballots
 from cprl.values import Natural
 from cprl.values.array_types import Bool, Float64, Int32, UInt8
 
@@ -29,7 +29,7 @@ class ClosedPatches(Limit):
     """The fine in apples for each harvest in a closed patch, which is a violation, if it is detected. None
     makes such harvests impossible."""
 
-    at_most: ClassVar[int | None] = 1
+    most_in_game: ClassVar[int | None] = 1
     shows_places: ClassVar[bool] = True
     counts: ClassVar[tuple[str, ...]] = ("closed_bites",)
 
@@ -45,7 +45,7 @@ class ClosedPatches(Limit):
             )
 
 
-class Arrays(NamedTuple):
+class PatchArrays(NamedTuple):
     """The patches of a game, on axis P; there are none in a game without `ClosedPatches`."""
 
     patch_of: Annotated[Int32, "K"]
@@ -58,47 +58,47 @@ class Arrays(NamedTuple):
     is_stopped: Annotated[Bool, "L"]
     fine: Annotated[Float64, "L"]
     observed: Annotated[Bool, "L"]
-    closed: Annotated[Bool, "B P", DERIVED]
+    is_closed: Annotated[Bool, "B P", DERIVED]
     """True for patches that are closed in the coming turn."""
     stock: Annotated[Int32, "B P", DERIVED]
     """The number of apples on each patch."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
+    """Return the parameters in `PatchArrays` by name."""
     patch_of = game.patches if with_ballots(game, ClosedPatches) else np.zeros(0, np.int32)
     sites = np.bincount(patch_of)
-    return {"patch_of": patch_of, "sites": sites, **columns(ClosedPatches, Arrays, game)}
+    return {"patch_of": patch_of, "sites": sites, **field_values(ClosedPatches, PatchArrays, game)}
 
 
-def is_patch_closed(patches: Arrays, site: int) -> bool:
+def is_patch_closed(patches: PatchArrays, site: int) -> bool:
     """Return whether the patch of a site is closed."""
-    return patches.closed[patches.patch_of[site]]
+    return patches.is_closed[patches.patch_of[site]]
 
 
-def count_apple(patches: Arrays, site: int, change: int) -> None:
+def count_apple(patches: PatchArrays, site: int, change: int) -> None:
     """Update the apples of a patch: an apple has appeared on a site (`change` 1) or gone (`change` -1)."""
     if patches.sites.shape[0] > 0:
         patches.stock[patches.patch_of[site]] += change
 
 
-def count_apples(patches: Arrays, stock: UInt8) -> None:
+def count_apples(patches: PatchArrays, stock: UInt8) -> None:
     """Count the apples on each patch, and close patches accordingly; `stock`: uint8 [K]."""
     if patches.sites.shape[0] > 0:
-        for p in range(patches.sites.shape[0]):
-            patches.stock[p] = 0
+        for patch in range(patches.sites.shape[0]):
+            patches.stock[patch] = 0
         for site in range(stock.shape[0]):
             patches.stock[patches.patch_of[site]] += stock[site]
         close_patches(patches)
 
 
-def close_patches(patches: Arrays) -> None:
+def close_patches(patches: PatchArrays) -> None:
     """Close the patches that hold too few apples for the coming turn, and open all others."""
-    for p in range(patches.sites.shape[0]):
-        patches.closed[p] = patches.stock[p] < patches.below[0]
+    for patch in range(patches.sites.shape[0]):
+        patches.is_closed[patch] = patches.stock[patch] < patches.below[0]
 
 
-def shows_closed(patches: Arrays, site: int) -> bool:
+def is_seen_as_closed(patches: PatchArrays, site: int) -> bool:
     """Return whether agents observe that the patch of a site is closed; `site`: -1 for a cell without one."""
     if patches.observed.shape[0] == 0 or not patches.observed[0] or site < 0:
         return False

@@ -29,14 +29,14 @@ class Punishment(Institution):
     shot_cost: Amount = 0.0
     """The apples that each shot costs the shooter, whether it tags or not."""
 
-    at_most: ClassVar[int | None] = 1
+    most_in_game: ClassVar[int | None] = 1
 
     @property
     def needs_tags(self) -> bool:
         return True
 
 
-class Arrays(NamedTuple):
+class PunishmentArrays(NamedTuple):
     """The parameters of a game's `Punishment`; axis P has length 1, or 0 without it."""
 
     fine: Annotated[Float64, "P"]
@@ -44,17 +44,17 @@ class Arrays(NamedTuple):
     shot_cost: Annotated[Float64, "P"]
 
 
-def punish(punishment: Arrays, ledger: Ledger, tagged_by: Bool, fired: Bool) -> None:
+def punish(punishment: PunishmentArrays, ledger: Ledger, tagged_by: Bool, fired: Bool) -> None:
     """Fine tagged agents, and charge agents for their tags and shots.
 
     `tagged_by`: bool [N, N], agent tagged, shooter; `fired`: bool [N].
     """
     if punishment.fine.shape[0] == 0:
         return
-    for i in range(tagged_by.shape[0]):
-        if fired[i]:
-            ledger.fines[i] += punishment.shot_cost[0]
-        for j in range(tagged_by.shape[0]):
-            if tagged_by[i, j]:
-                ledger.fines[i] += punishment.fine[0]
-                ledger.fines[j] += punishment.cost[0]
+    for agent in range(tagged_by.shape[0]):
+        if fired[agent]:
+            ledger.fines[agent] += punishment.shot_cost[0]
+        for shooter in range(tagged_by.shape[0]):
+            if tagged_by[agent, shooter]:
+                ledger.fines[agent] += punishment.fine[0]
+                ledger.fines[shooter] += punishment.cost[0]

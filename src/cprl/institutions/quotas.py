@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any, ClassVar, Final, NamedTuple
 
 from cprl.institutions.arrays import STEPS, InState
-from cprl.institutions.institution import Amount, Limit, columns, with_ballots
+from cprl.institutions.institution import Amount, Limit, field_values, with_ballots
 from cprl.institutions.ledger import Ledger
 from cprl.values import Positive, Range
 from cprl.values.array_types import Bool, Float64, Int32
@@ -45,12 +45,12 @@ class Quota(Limit):
     voted_on: ClassVar[str] = "the quota's share"
 
 
-class Arrays(NamedTuple):
+class QuotaArrays(NamedTuple):
     """The parameters and memory of all `Quota` of a game, one of them per index of axis Q."""
 
-    unit: Annotated[Float64, "Q"]
+    window_yield: Annotated[Float64, "Q"]
     """The apples that an agent may harvest in a window at a share of 1."""
-    full: Annotated[Float64, "Q"]
+    largest_allowed: Annotated[Float64, "Q"]
     """The most apples that an agent may ever harvest in a window; what agents observe is relative to it."""
     share: Annotated[Float64, "Q"]
     ballot: Annotated[Int32, "Q"]
@@ -66,7 +66,7 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
+    """Return the parameters in `QuotaArrays` by name."""
     quotas = with_ballots(game, Quota)
     agent_yield = game.sustainable_yield / game.agents if quotas else 0.0
     largest_shares = [
@@ -74,9 +74,13 @@ def parameters(game: Any) -> dict[str, Any]:
     ]
     for (quota, _), share in zip(quotas, largest_shares, strict=True):
         _warn_of_less_than_an_apple(quota, agent_yield * share)
-    unit = [agent_yield * quota.window_steps for quota, _ in quotas]
-    full = [share * apples for share, apples in zip(largest_shares, unit, strict=True)]
-    return {"unit": unit, "full": full, **columns(Quota, Arrays, game)}
+    window_yield = [agent_yield * quota.window_steps for quota, _ in quotas]
+    largest_allowed = [share * apples for share, apples in zip(largest_shares, window_yield, strict=True)]
+    return {
+        "window_yield": window_yield,
+        "largest_allowed": largest_allowed,
+        **field_values(Quota, QuotaArrays, game),
+    }
 
 
 def _warn_of_less_than_an_apple(quota: Quota, apples_per_turn: float) -> None:
@@ -93,41 +97,41 @@ def _warn_of_less_than_an_apple(quota: Quota, apples_per_turn: float) -> None:
         )
 
 
-def open_windows(quotas: Arrays, ledger: Ledger, turn: int, stock_share: float) -> None:
+def open_windows(quotas: QuotaArrays, ledger: Ledger, turn: int, stock_share: float) -> None:
     """Open the windows that begin with a turn, and compute how much agents may harvest in them.
 
     `stock_share`: the share of all sites that hold an apple.
     """
-    for q in range(quotas.window_steps.shape[0]):
-        if (turn - 1) % quotas.window_steps[q] == 0:
-            share = quotas.share[q]
-            if quotas.ballot[q] >= 0:
-                share = ledger.in_force[quotas.ballot[q]]
-            if quotas.by_stock[q]:
+    for quota in range(quotas.window_steps.shape[0]):
+        if (turn - 1) % quotas.window_steps[quota] == 0:
+            share = quotas.share[quota]
+            if quotas.ballot[quota] >= 0:
+                share = ledger.in_force[quotas.ballot[quota]]
+            if quotas.by_stock[quota]:
                 share *= stock_share
-            quotas.allowed[q] = share * quotas.unit[q]
-            for i in range(quotas.taken.shape[1]):
-                quotas.taken[q, i] = 0
+            quotas.allowed[quota] = share * quotas.window_yield[quota]
+            for agent in range(quotas.taken.shape[1]):
+                quotas.taken[quota, agent] = 0
 
 
-def is_used_up(quotas: Arrays, q: int, i: int) -> bool:
-    """Return whether one more harvest of agent i would exceed quota q."""
-    return quotas.taken[q, i] + 1 > quotas.allowed[q] + ROUNDING
+def is_used_up(quotas: QuotaArrays, quota: int, agent: int) -> bool:
+    """Return whether one more harvest of an agent would exceed a quota."""
+    return quotas.taken[quota, agent] + 1 > quotas.allowed[quota] + ROUNDING
 
 
-def use_quotas(quotas: Arrays, i: int) -> None:
-    """Count a harvest of agent i for all quotas."""
-    for q in range(quotas.window_steps.shape[0]):
-        quotas.taken[q, i] += 1
+def use_quotas(quotas: QuotaArrays, agent: int) -> None:
+    """Count a harvest of an agent for all quotas."""
+    for quota in range(quotas.window_steps.shape[0]):
+        quotas.taken[quota, agent] += 1
 
 
-def show_quota(quotas: Arrays, what: int, q: int, i: int, turn: int) -> float:
-    """Return what agent i observes of quota q after a turn, 0..1.
+def show_quota(quotas: QuotaArrays, entry: int, quota: int, agent: int, turn: int) -> float:
+    """Return what an agent observes of a quota after a turn, 0..1.
 
     Entry 0 is the number of apples that it may still harvest, relative to the largest quota; entry 1 is the
-    part of the window that is left. `what`: the index of the entry.
+    part of the window that is left.
     """
-    if what == 1:
-        return (quotas.window_steps[q] - turn % quotas.window_steps[q]) / quotas.window_steps[q]
-    left = quotas.allowed[q] - quotas.taken[q, i]
-    return left / quotas.full[q] if left > 0 and quotas.full[q] > 0 else 0.0
+    if entry == 1:
+        return (quotas.window_steps[quota] - turn % quotas.window_steps[quota]) / quotas.window_steps[quota]
+    left = quotas.allowed[quota] - quotas.taken[quota, agent]
+    return left / quotas.largest_allowed[quota] if left > 0 and quotas.largest_allowed[quota] > 0 else 0.0

@@ -30,7 +30,7 @@ class Rotation(Limit):
     entries: ClassVar[tuple[str, ...]] = ("may harvest", "window time")
 
 
-class Arrays(NamedTuple):
+class RotationArrays(NamedTuple):
     """The parameters of all `Rotation` of a game, one of them per index of axis R."""
 
     window_steps: Annotated[Int32, "R"]
@@ -38,17 +38,20 @@ class Arrays(NamedTuple):
     fine: Annotated[Float64, "R"]
 
 
-def is_out_of_turn(rotations: Arrays, ledger: Ledger, r: int, i: int, turn: int) -> bool:
-    """Return whether agent i may not harvest in a turn, counted from 1, under rotation r."""
-    return (turn - 1) // rotations.window_steps[r] % ledger.fines.shape[0] != i
+def is_out_of_turn(rotations: RotationArrays, ledger: Ledger, rotation: int, agent: int, turn: int) -> bool:
+    """Return whether an agent may not harvest in a turn, counted from 1, under a rotation."""
+    return (turn - 1) // rotations.window_steps[rotation] % ledger.fines.shape[0] != agent
 
 
-def show_rotation(rotations: Arrays, ledger: Ledger, what: int, r: int, i: int, turn: int) -> float:
-    """Return what agent i observes of rotation r after a turn, 0..1.
+def show_rotation(
+    rotations: RotationArrays, ledger: Ledger, entry: int, rotation: int, agent: int, turn: int
+) -> float:
+    """Return what an agent observes of a rotation after a turn, 0..1.
 
-    Entry 0 is 1 if it may harvest in the coming turn; entry 1 is the part of the window that is left. `what`:
-    the index of the entry.
+    Entry 0 is 1 if it may harvest in the coming turn; entry 1 is the part of the window that is left.
     """
-    if what == 0:
-        return 0.0 if is_out_of_turn(rotations, ledger, r, i, turn + 1) else 1.0
-    return (rotations.window_steps[r] - turn % rotations.window_steps[r]) / rotations.window_steps[r]
+    if entry == 0:
+        return 0.0 if is_out_of_turn(rotations, ledger, rotation, agent, turn + 1) else 1.0
+    return (
+        rotations.window_steps[rotation] - turn % rotations.window_steps[rotation]
+    ) / rotations.window_steps[rotation]

@@ -36,7 +36,7 @@ class Sanctioner(Institution):
     equally likely."""
 
     entries: ClassVar[tuple[str, ...]] = ("may fire",)
-    at_most: ClassVar[int | None] = 1
+    most_in_game: ClassVar[int | None] = 1
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -63,10 +63,10 @@ class Sanctioner(Institution):
         check_agent_indices("Sanctioner.agents", self.agents or (), game.agents)
 
 
-class Arrays(NamedTuple):
+class SanctionerArrays(NamedTuple):
     """The agents that may fire."""
 
-    listed: Annotated[Bool, "N"]
+    is_listed: Annotated[Bool, "N"]
     """True for agents that may fire if there is no election."""
     ballot: int
     """The ballot that elects the agent that may fire; -1 for none."""
@@ -75,21 +75,21 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name; without a `Sanctioner` all agents may fire."""
+    """Return the parameters in `SanctionerArrays` by name; without a `Sanctioner` all agents may fire."""
     sanctioner, ballot = next(iter(with_ballots(game, Sanctioner)), (Sanctioner(), -1))
     listed = sanctioner.agents or range(game.agents)
-    return {"listed": [agent in listed for agent in range(game.agents)], "ballot": ballot}
+    return {"is_listed": [agent in listed for agent in range(game.agents)], "ballot": ballot}
 
 
-def appoint(sanctioner: Arrays, ledger: Ledger) -> None:
+def appoint(sanctioner: SanctionerArrays, ledger: Ledger) -> None:
     """Write which agents may fire: the elected one, or those that the game lists."""
-    for i in range(sanctioner.may_fire.shape[0]):
+    for agent in range(sanctioner.may_fire.shape[0]):
         if sanctioner.ballot >= 0:
-            sanctioner.may_fire[i] = ledger.in_force[sanctioner.ballot] == i
+            sanctioner.may_fire[agent] = ledger.in_force[sanctioner.ballot] == agent
         else:
-            sanctioner.may_fire[i] = sanctioner.listed[i]
+            sanctioner.may_fire[agent] = sanctioner.is_listed[agent]
 
 
-def show_may_fire(sanctioner: Arrays, i: int) -> float:
-    """Return what agent i observes of the sanctioner: 1 if it may fire, else 0."""
-    return 1.0 if sanctioner.may_fire[i] else 0.0
+def show_may_fire(sanctioner: SanctionerArrays, agent: int) -> float:
+    """Return what an agent observes of the sanctioner: 1 if it may fire, else 0."""
+    return 1.0 if sanctioner.may_fire[agent] else 0.0

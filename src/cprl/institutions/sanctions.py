@@ -53,7 +53,7 @@ class GraduatedSanctions(Institution):
     institution, and that is detected. "both": either of them."""
 
     entries: ClassVar[tuple[str, ...]] = ("sanction level",)
-    at_most: ClassVar[int | None] = 1
+    most_in_game: ClassVar[int | None] = 1
     counts: ClassVar[tuple[str, ...]] = ("sanctions", "returns_to_violation")
     voted_on: ClassVar[str] = "the level of a first offence"
 
@@ -101,14 +101,14 @@ class GraduatedSanctions(Institution):
             )
 
 
-class Arrays(NamedTuple):
+class SanctionArrays(NamedTuple):
     """The sanctions of a game by level, on axis L, and the level of each agent."""
 
-    steps: Annotated[Int32, "N L"]
-    """The time-out by shooter and level; [N, 0] without `GraduatedSanctions`."""
+    freeze_steps: Annotated[Int32, "N L"]
+    """The time-out by shooter and level."""
     fine: Annotated[Float64, "fines"]
     """The fine by level."""
-    recovery: int
+    recovery_steps: int
     """The turns without an offence after which a level falls; 0 for never."""
     for_tags: bool
     for_violations: bool
@@ -121,87 +121,88 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
-    for sanctions, ballot in with_ballots(game, GraduatedSanctions):
-        levels = np.atleast_2d(sanctions.freeze_steps)
-        return {
-            "steps": np.broadcast_to(levels, (game.agents, levels.shape[1])),
-            "fine": sanctions.fines,
-            "recovery": sanctions.recovery_steps or 0,
-            "for_tags": sanctions.is_for_tags,
-            "for_violations": sanctions.on != "tags",
-            "ballot": ballot,
-        }
-    steps = np.zeros((game.agents, 0))
-    nothing = {"fine": (), "recovery": 0, "for_tags": False, "for_violations": False, "ballot": -1}
-    return {"steps": steps, **nothing}
+    """Return the parameters in `SanctionArrays`; without `GraduatedSanctions` nothing is an offence."""
+    in_game = with_ballots(game, GraduatedSanctions)
+    sanctions, ballot = in_game[0] if in_game else (GraduatedSanctions(recovery_steps=None), -1)
+    levels = np.atleast_2d(sanctions.freeze_steps)
+    return {
+        "freeze_steps": np.broadcast_to(levels, (game.agents, levels.shape[1])),
+        "fine": sanctions.fines,
+        "recovery_steps": sanctions.recovery_steps or 0,
+        "for_tags": bool(in_game) and sanctions.is_for_tags,
+        "for_violations": bool(in_game) and sanctions.on != "tags",
+        "ballot": ballot,
+    }
 
 
-def forget_offences(sanctions: Arrays) -> None:
+def forget_offences(sanctions: SanctionArrays) -> None:
     """Clear the levels of all agents when an episode begins."""
-    for i in range(sanctions.level.shape[0]):
-        sanctions.level[i] = 0
-        sanctions.offence_step[i] = 0
+    for agent in range(sanctions.level.shape[0]):
+        sanctions.level[agent] = 0
+        sanctions.offence_step[agent] = 0
 
 
-def next_level(sanctions: Arrays, ledger: Ledger, i: int) -> int:
-    """Return the level at which the next offence of agent i is punished."""
+def next_level(sanctions: SanctionArrays, ledger: Ledger, agent: int) -> int:
+    """Return the level at which the next offence of an agent is punished."""
     if sanctions.ballot < 0:
-        return sanctions.level[i]
-    return sanctions.level[i] + int(ledger.in_force[sanctions.ballot])
+        return sanctions.level[agent]
+    return sanctions.level[agent] + int(ledger.in_force[sanctions.ballot])
 
 
-def time_out(sanctions: Arrays, ledger: Ledger, shooter: int, i: int) -> int:
-    """Return the turns that agent i misses for an offence at its level; `shooter`: who tagged it."""
-    level = next_level(sanctions, ledger, i)
-    return sanctions.steps[shooter, min(level, sanctions.steps.shape[1] - 1)]
+def time_out(sanctions: SanctionArrays, ledger: Ledger, shooter: int, agent: int) -> int:
+    """Return the turns that an agent misses for an offence at its level; `shooter`: who tagged it."""
+    level = next_level(sanctions, ledger, agent)
+    return sanctions.freeze_steps[shooter, min(level, sanctions.freeze_steps.shape[1] - 1)]
 
 
-def offend(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> None:
-    """Let agent i pay the fine of its level for an offence, and raise its level by one."""
-    level = next_level(sanctions, ledger, i)
-    ledger.fines[i] += sanctions.fine[min(level, sanctions.fine.shape[0] - 1)]
-    sanctions.level[i] += 1
-    sanctions.offence_step[i] = turn
-    ledger.counts[i, SANCTIONS] += 1
+def offend(sanctions: SanctionArrays, ledger: Ledger, agent: int, turn: int) -> None:
+    """Let an agent pay the fine of its level for an offence, and raise its level by one."""
+    level = next_level(sanctions, ledger, agent)
+    ledger.fines[agent] += sanctions.fine[min(level, sanctions.fine.shape[0] - 1)]
+    sanctions.level[agent] += 1
+    sanctions.offence_step[agent] = turn
+    ledger.counts[agent, SANCTIONS] += 1
 
 
 def sanction_tag(
-    sanctions: Arrays, ledger: Ledger, tagged_by: Bool, i: int, turn: int, freeze_steps: int
+    sanctions: SanctionArrays, ledger: Ledger, tagged_by: Bool, agent: int, turn: int, freeze_steps: int
 ) -> int:
-    """Punish agent i for being tagged, if that is an offence, and return the turns that it misses.
+    """Punish an agent for being tagged, if that is an offence, and return the turns that it misses.
 
     `tagged_by`: bool [N, N]; `freeze_steps`: the turns that it misses if being tagged is no offence.
     """
     if not sanctions.for_tags:
         return freeze_steps
     steps = 0
-    for j in range(tagged_by.shape[0]):
-        if tagged_by[i, j]:
-            steps = max(steps, time_out(sanctions, ledger, j, i))
-    offend(sanctions, ledger, i, turn)
+    for shooter in range(tagged_by.shape[0]):
+        if tagged_by[agent, shooter]:
+            steps = max(steps, time_out(sanctions, ledger, shooter, agent))
+    offend(sanctions, ledger, agent, turn)
     return steps
 
 
-def sanction_violation(sanctions: Arrays, ledger: Ledger, i: int, turn: int) -> int:
-    """Punish agent i for a detected violation, if that is an offence, and return the turns that it misses."""
+def sanction_violation(sanctions: SanctionArrays, ledger: Ledger, agent: int, turn: int) -> int:
+    """Punish an agent for a detected violation, if that is an offence; return the turns that it misses."""
     if not sanctions.for_violations:
         return 0
-    steps = time_out(sanctions, ledger, i, i)
-    offend(sanctions, ledger, i, turn)
+    steps = time_out(sanctions, ledger, agent, agent)
+    offend(sanctions, ledger, agent, turn)
     return steps
 
 
-def forgive(sanctions: Arrays, turn: int) -> None:
-    """Lower the level of agents whose last offence, or last fall of level, is `recovery` turns ago."""
-    if sanctions.recovery > 0:
-        for i in range(sanctions.level.shape[0]):
-            if sanctions.level[i] > 0 and turn - sanctions.offence_step[i] >= sanctions.recovery:
-                sanctions.level[i] -= 1
-                sanctions.offence_step[i] = turn
+def forgive(sanctions: SanctionArrays, turn: int) -> None:
+    """Lower the level of agents whose last offence, or last fall of level, is `recovery_steps` turns ago."""
+    if sanctions.recovery_steps > 0:
+        for agent in range(sanctions.level.shape[0]):
+            if (
+                sanctions.level[agent] > 0
+                and turn - sanctions.offence_step[agent] >= sanctions.recovery_steps
+            ):
+                sanctions.level[agent] -= 1
+                sanctions.offence_step[agent] = turn
 
 
-def show_level(sanctions: Arrays, ledger: Ledger, i: int) -> float:
-    """Return what agent i observes of its level: the level relative to the highest one, 0..1."""
-    last = max(1, sanctions.fine.shape[0] - 1, sanctions.steps.shape[1] - 1)
-    return min(next_level(sanctions, ledger, i), last) / last
+def show_level(sanctions: SanctionArrays, ledger: Ledger, agent: int) -> float:
+    """Return what an agent observes of its level: the level relative to the highest one, 0..1."""
+    last = max(1, sanctions.fine.shape[0] - 1, sanctions.freeze_steps.shape[1] - 1)
+    return min(next_level(sanctions, ledger, agent), last) / last

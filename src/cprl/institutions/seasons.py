@@ -39,7 +39,7 @@ class ClosedSeason(Limit):
             )
 
 
-class Arrays(NamedTuple):
+class SeasonArrays(NamedTuple):
     """The parameters of all `ClosedSeason` of a game, one of them per index of axis S."""
 
     period_steps: Annotated[Int32, "S"]
@@ -48,20 +48,22 @@ class Arrays(NamedTuple):
     fine: Annotated[Float64, "S"]
 
 
-def is_season_closed(seasons: Arrays, s: int, turn: int) -> bool:
-    """Return whether season s is closed in a turn, counted from 1."""
-    return (turn - 1) % seasons.period_steps[s] >= seasons.period_steps[s] - seasons.closed_steps[s]
+def is_season_closed(seasons: SeasonArrays, season: int, turn: int) -> bool:
+    """Return whether a season is closed in a turn, counted from 1."""
+    return (turn - 1) % seasons.period_steps[season] >= seasons.period_steps[season] - seasons.closed_steps[
+        season
+    ]
 
 
-def show_season(seasons: Arrays, what: int, s: int, turn: int) -> float:
-    """Return what agents observe of season s after a turn, 0..1.
+def show_season(seasons: SeasonArrays, entry: int, season: int, turn: int) -> float:
+    """Return what agents observe of a season after a turn, 0..1.
 
     Entry 0 is 1 if the season is closed in the coming turn; entry 1 is the time until that changes, in
-    periods. `what`: the index of the entry.
+    periods. `entry`: its index.
     """
-    if what == 0:
-        return 1.0 if is_season_closed(seasons, s, turn + 1) else 0.0
-    period = seasons.period_steps[s]
+    if entry == 0:
+        return 1.0 if is_season_closed(seasons, season, turn + 1) else 0.0
+    period = seasons.period_steps[season]
     within = turn % period
-    open_steps = period - seasons.closed_steps[s]
+    open_steps = period - seasons.closed_steps[season]
     return ((open_steps if within < open_steps else period) - within) / period

@@ -97,19 +97,19 @@ class Levies(Institution):
         return tuple(group_by_agent[agent] for agent in sorted(group_by_agent))
 
 
-class Arrays(NamedTuple):
+class TaxArrays(NamedTuple):
     """The parameters and memory of all taxes of a game, one per index of axis T.
 
     A `Levies` counts as two taxes: one is paid out within groups, the other among all agents.
     """
 
-    from_: Annotated[Float64, "T bounds"]
+    bracket_begin: Annotated[Float64, "T bounds"]
     """The apples at which each bracket begins, with the end of the last bracket as a last entry; infinite for
     brackets that a tax lacks."""
     rate: Annotated[Float64, "T brackets"]
     ballot: Annotated[Int32, "T"]
     """The ballot that decides the rate; -1 for none."""
-    steps: Annotated[Int32, "T"]
+    period_steps: Annotated[Int32, "T"]
     """The number of turns in a period."""
     group: Annotated[Int32, "T N"]
     """The index of the group within which the tax of each agent is paid out; -1 for a tax that is lost."""
@@ -120,7 +120,7 @@ class Arrays(NamedTuple):
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
+    """Return the parameters in `TaxArrays` by name."""
     # one row per tax: ballot, period, group of each agent, brackets
     rows: list[tuple[int, int, tuple[int, ...], tuple[tuple[float, float], ...]]] = []
     for tax, ballot in with_ballots(game, Tax):
@@ -130,70 +130,76 @@ def parameters(game: Any) -> dict[str, Any]:
         rows.append((-1, 1, levies.group_of, ((0.0, levies.local_rate),)))
         rows.append((-1, 1, (0,) * game.agents, ((0.0, levies.joint_rate),)))
     most_brackets = max((len(brackets) for *_, brackets in rows), default=1)
-    from_ = np.full((len(rows), most_brackets + 1), np.inf)
+    bracket_begin = np.full((len(rows), most_brackets + 1), np.inf)
     rate = np.zeros((len(rows), most_brackets))
     for row, (*_, brackets) in enumerate(rows):
-        from_[row, : len(brackets)], rate[row, : len(brackets)] = np.transpose(brackets)
+        bracket_begin[row, : len(brackets)], rate[row, : len(brackets)] = np.transpose(brackets)
     ballots, steps, groups, _ = zip(*rows, strict=True) if rows else ((), (), (), ())
     group_of = np.reshape(groups, (-1, game.agents))
-    return {"from_": from_, "rate": rate, "ballot": ballots, "steps": steps, "group": group_of}
+    return {
+        "bracket_begin": bracket_begin,
+        "rate": rate,
+        "ballot": ballots,
+        "period_steps": steps,
+        "group": group_of,
+    }
 
 
-def forget_income(taxes: Arrays) -> None:
+def forget_income(taxes: TaxArrays) -> None:
     """Clear the harvests that taxes remember when an episode begins."""
     for tax in range(taxes.income.shape[0]):
-        for i in range(taxes.income.shape[1]):
-            taxes.income[tax, i] = 0.0
+        for agent in range(taxes.income.shape[1]):
+            taxes.income[tax, agent] = 0.0
 
 
-def note_income(taxes: Arrays, i: int) -> None:
-    """Count a harvest of agent i for all taxes."""
-    for tax in range(taxes.steps.shape[0]):
-        taxes.income[tax, i] += 1.0
+def note_income(taxes: TaxArrays, agent: int) -> None:
+    """Count a harvest of an agent for all taxes."""
+    for tax in range(taxes.period_steps.shape[0]):
+        taxes.income[tax, agent] += 1.0
 
 
-def collect_taxes(taxes: Arrays, ledger: Ledger, turn: int, is_over: bool) -> None:
+def collect_taxes(taxes: TaxArrays, ledger: Ledger, turn: int, is_over: bool) -> None:
     """Collect and pay out the taxes whose period ends with this turn; `is_over`: the episode ends with it."""
     agents = ledger.fines.shape[0]
-    for tax in range(taxes.steps.shape[0]):
-        if (is_over or turn % taxes.steps[tax] == 0) and has_income(taxes, tax):
-            for i in range(agents):
-                taxes.owed[i] = tax_of(taxes, ledger, tax, i)
-                ledger.fines[i] += taxes.owed[i]
-                taxes.income[tax, i] = 0.0
-            for i in range(agents):
-                if taxes.group[tax, i] >= 0:
-                    pay_out(taxes, ledger, tax, i)
+    for tax in range(taxes.period_steps.shape[0]):
+        if (is_over or turn % taxes.period_steps[tax] == 0) and has_income(taxes, tax):
+            for agent in range(agents):
+                taxes.owed[agent] = tax_of(taxes, ledger, tax, agent)
+                ledger.fines[agent] += taxes.owed[agent]
+                taxes.income[tax, agent] = 0.0
+            for agent in range(agents):
+                if taxes.group[tax, agent] >= 0:
+                    pay_out(taxes, ledger, tax, agent)
 
 
-def has_income(taxes: Arrays, tax: int) -> bool:
+def has_income(taxes: TaxArrays, tax: int) -> bool:
     """Return whether any agent harvested in the period of a tax."""
-    for i in range(taxes.income.shape[1]):
-        if taxes.income[tax, i] > 0:
+    for agent in range(taxes.income.shape[1]):
+        if taxes.income[tax, agent] > 0:
             return True
     return False
 
 
-def tax_of(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> float:
-    """Return the apples of a tax that agent i owes for its harvest in the period."""
-    income = taxes.income[tax, i]
+def tax_of(taxes: TaxArrays, ledger: Ledger, tax: int, agent: int) -> float:
+    """Return the apples of a tax that an agent owes for its harvest in the period."""
+    income = taxes.income[tax, agent]
     owed = 0.0
     if taxes.ballot[tax] >= 0:
         return ledger.in_force[taxes.ballot[tax]] * income
     for bracket in range(taxes.rate.shape[1]):
-        from_ = taxes.from_[tax, bracket]
-        if income > from_:
-            upper = min(income, taxes.from_[tax, bracket + 1])
-            owed += taxes.rate[tax, bracket] * (upper - from_)
+        begin = taxes.bracket_begin[tax, bracket]
+        if income > begin:
+            upper = min(income, taxes.bracket_begin[tax, bracket + 1])
+            owed += taxes.rate[tax, bracket] * (upper - begin)
     return owed
 
 
-def pay_out(taxes: Arrays, ledger: Ledger, tax: int, i: int) -> None:
-    """Give agent i its equal part of the tax that the members of its group owed."""
+def pay_out(taxes: TaxArrays, ledger: Ledger, tax: int, agent: int) -> None:
+    """Give an agent its equal part of the tax that the members of its group owed."""
     pool = 0.0
     members = 0
-    for j in range(ledger.fines.shape[0]):
-        if taxes.group[tax, j] == taxes.group[tax, i]:
-            pool += taxes.owed[j]
+    for member in range(ledger.fines.shape[0]):
+        if taxes.group[tax, member] == taxes.group[tax, agent]:
+            pool += taxes.owed[member]
             members += 1
-    ledger.transfers[i] += pool / members
+    ledger.transfers[agent] += pool / members

@@ -71,26 +71,26 @@ class Vote(Institution):
             override_prob=self.override_prob,
         )
 
-    def shows(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
+    def shown_entries(self, *, number: int, ballot: int, agents: int) -> list[tuple[str, int]]:
         return [("in force", ballot)]
 
 
-class Arrays(NamedTuple):
+class BallotArrays(NamedTuple):
     """The parameters of all ballots of a game, one of them per index of axis V."""
 
     options: Annotated[Int32, "V"]
     """The number of choices."""
     choices: Annotated[Float64, "V choices"]
     is_election: Annotated[Bool, "V"]
-    episodes: Annotated[Int32, "V"]
+    period_episodes: Annotated[Int32, "V"]
     """The number of episodes from one time that the ballot is held to the next; 0 for the number that a
     governor sets, on which no agent votes."""
-    override: Annotated[Int64, "V"]
+    override_below: Annotated[Int64, "V"]
     """The result is overridden if a uniform 32-bit word is below this threshold."""
 
 
 def parameters(game: Any) -> dict[str, Any]:
-    """Return the parameters in `Arrays` by name."""
+    """Return the parameters in `BallotArrays` by name."""
     ballots = game.in_force
     most_choices = max((len(ballot.choices) for ballot in ballots), default=1)
     choices = np.zeros((len(ballots), most_choices))
@@ -100,38 +100,38 @@ def parameters(game: Any) -> dict[str, Any]:
         "options": [len(ballot.choices) for ballot in ballots],
         "choices": choices,
         "is_election": [ballot.is_election for ballot in ballots],
-        "episodes": [ballot.period_episodes for ballot in ballots],
-        "override": [threshold(ballot.override_prob) for ballot in ballots],
+        "period_episodes": [ballot.period_episodes for ballot in ballots],
+        "override_below": [threshold(ballot.override_prob) for ballot in ballots],
     }
 
 
-def is_due(ballots: Arrays, ballot: int, episode: int) -> bool:
+def is_due(ballots: BallotArrays, ballot: int, episode: int) -> bool:
     """Return whether a ballot is held in an episode, counted from 0."""
-    return ballots.episodes[ballot] > 0 and episode % ballots.episodes[ballot] == 0
+    return ballots.period_episodes[ballot] > 0 and episode % ballots.period_episodes[ballot] == 0
 
 
-def has_governor(ballots: Arrays) -> bool:
+def has_governor(ballots: BallotArrays) -> bool:
     """Return whether a governor sets the last number in force."""
-    last = ballots.episodes.shape[0] - 1
-    return last >= 0 and ballots.episodes[last] == 0
+    last = ballots.period_episodes.shape[0] - 1
+    return last >= 0 and ballots.period_episodes[last] == 0
 
 
-def choice_of(ballots: Arrays, ballot: int, decision: int) -> int:
+def choice_of(ballots: BallotArrays, ballot: int, decision: int) -> int:
     """Return the index of the choice that a decision makes on a ballot; see `cprl.Game.ballots`."""
     for before in range(ballot):
         decision //= ballots.options[before]
     return decision % ballots.options[ballot]
 
 
-def votes_for(ballots: Arrays, ballot: int, decisions: Int64, choice: int) -> int:
+def votes_for(ballots: BallotArrays, ballot: int, decisions: Int64, choice: int) -> int:
     """Return the number of agents that decide for a choice on a ballot; `decisions`: int64 [N]."""
     votes = 0
-    for i in range(decisions.shape[0]):
-        votes += choice_of(ballots, ballot, decisions[i]) == choice
+    for agent in range(decisions.shape[0]):
+        votes += choice_of(ballots, ballot, decisions[agent]) == choice
     return votes
 
 
-def median_choice(ballots: Arrays, ballot: int, decisions: Int64) -> int:
+def median_choice(ballots: BallotArrays, ballot: int, decisions: Int64) -> int:
     """Return the index of the median of the N agents' choices; of two middle ones the lower."""
     choice = 0
     votes = votes_for(ballots, ballot, decisions, choice)
@@ -141,7 +141,7 @@ def median_choice(ballots: Arrays, ballot: int, decisions: Int64) -> int:
     return choice
 
 
-def elected_choice(ballots: Arrays, ballot: int, decisions: Int64, word: np.uint64) -> int:
+def elected_choice(ballots: BallotArrays, ballot: int, decisions: Int64, word: np.uint64) -> int:
     """Return the index of the choice with most votes; a uniform 32-bit word decides between equal ones."""
     most = 0
     tied = 0
@@ -162,7 +162,7 @@ def elected_choice(ballots: Arrays, ballot: int, decisions: Int64, word: np.uint
 
 
 def hold_ballot(
-    ballots: Arrays,
+    ballots: BallotArrays,
     ledger: Ledger,
     ballot: int,
     decisions: Int64,
@@ -172,7 +172,7 @@ def hold_ballot(
 
     `decisions`: int64 [N]; `words`: uniform random 32-bit words.
     """
-    if np.int64(words[0]) < ballots.override[ballot]:
+    if np.int64(words[0]) < ballots.override_below[ballot]:
         choice = np.int64(words[1] % np.uint64(ballots.options[ballot]))
     elif ballots.is_election[ballot]:
         choice = np.int64(elected_choice(ballots, ballot, decisions, words[2]))
@@ -181,6 +181,6 @@ def hold_ballot(
     ledger.in_force[ballot] = ballots.choices[ballot, choice]
 
 
-def show_in_force(ballots: Arrays, ledger: Ledger, ballot: int) -> float:
+def show_in_force(ballots: BallotArrays, ledger: Ledger, ballot: int) -> float:
     """Return what agents observe of a ballot: the value in force, relative to the highest choice."""
     return ledger.in_force[ballot] / ballots.choices[ballot, ballots.options[ballot] - 1]

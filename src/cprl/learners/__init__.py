@@ -19,6 +19,5 @@ Modules, in the order in which one reads them:
     loss_state     find what a loss keeps from one call to the next
     refusals       refuse losses and networks that do not fit the memory or the settings
     lola           the memory and networks of teams whose members anticipate how the others learn
-    tabular        TabularLearner: Q-learning in tables
-    protocol       AnyLearner: the methods that the training loop calls on any learner
+    tabular        the memory and the tables of agents that learn by Q-learning in tables
 """

@@ -9,13 +9,14 @@ from dataclasses import KW_ONLY, dataclass, field
 from math import prod
 from typing import Annotated, Any, TypeAlias
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from cprl import recurrent_state
+from cprl import keys
 from cprl.commons.spaces import Spaces
-from cprl.keys import Turn
-from cprl.learners.transitions import LaneTurn, TransitionForm, joint_actions_by_agent, lane_turn
+from cprl.keys import Turn, recurrent_state
+from cprl.learners.transitions import LaneTurn, TransitionForm, joint_actions_by_agent
 from cprl.objectives.rewards import Reward, check_reward
 from cprl.policies.rng import Purpose, lane_names, lane_seeds
 from cprl.values import Natural, Range, Value
@@ -113,28 +114,46 @@ class Lanes(Value, stored=False):
         )
 
     def turn(self, turn: Turn, rewards: Any, form: TransitionForm) -> LaneTurn:
-        """Return one transition of every lane in each of its worlds, C = L x W columns; see `lane_turn`.
+        """Return one transition of every lane in each of its worlds, C = L x W columns.
+
+        Fields are views of the turn's entries where that is possible.
 
         Args:
             turn: one turn of all worlds.
             rewards: the shaped rewards of all agents, [B, N]; equal for all agents under the team reward.
             form: the shapes of what is stored.
         """
-        transitions = lane_turn(self.agents, turn, rewards, are_team=self.are_teams)
+        reward = self._by_column(rewards)
         if self.are_teams and not form.reward_shape:  # all members get the same: one number is enough
-            transitions = transitions._replace(reward=transitions.reward[:, 0])
-        if form.action_shape != self.members:  # the actions of all agents of the game, see `OffPolicy`
-            transitions = transitions._replace(action=joint_actions_by_agent(self.agents, turn))
-        if form.state_cells:
-            states_before = self.states(turn, recurrent_state.BEFORE, form.state_cells)
-            states_after = self.states(turn, recurrent_state.AFTER, form.state_cells)
-            transitions = transitions._replace(
-                recurrent_state=states_before, next_recurrent_state=states_after
-            )
-        if form.has_in_play:
-            in_play = turn.agents["in_play"][:, list(self.agents)]
-            transitions = transitions._replace(in_play=in_play.reshape(-1, *self.members))
-        return transitions
+            reward = reward[:, 0]
+        if form.action_shape == self.members:
+            action = self._by_column(turn.agents["action"])
+        else:  # the actions of all agents of the game, see `OffPolicy`
+            action = joint_actions_by_agent(self.agents, turn)
+        cells = form.state_cells
+        return LaneTurn(
+            observation=self._by_column(turn.agents["observation"]),
+            action=action,
+            next_observation=self._by_column(turn.next_agents["observation"]),
+            reward=reward,
+            done=self._flags_by_column(turn.next_world[keys.DONE]),
+            terminated=self._flags_by_column(turn.next_world[keys.TERMINATED]),
+            recurrent_state=self.states(turn, recurrent_state.BEFORE, cells) if cells else None,
+            next_recurrent_state=self.states(turn, recurrent_state.AFTER, cells) if cells else None,
+            in_play=self._by_column(turn.agents["in_play"]) if form.has_in_play else None,
+        )
+
+    def _by_column(self, entry: Any) -> Any:
+        """Return an entry of all agents of the game, [B, N, ...], by column, [C, ...], or [C, S, ...] of
+        teams."""
+        all_learn = self.agents == tuple(range(self.spaces.agents))
+        selected = entry if all_learn else entry[:, list(self.agents)]
+        return selected.reshape(-1, *self.members, *entry.shape[2:])
+
+    def _flags_by_column(self, flags: Any) -> Any:
+        """Return flags of worlds, bool [B, 1], by column, [C]."""
+        count = len(self) // self.replicas
+        return flags.repeat(count) if isinstance(flags, np.ndarray) else flags.repeat_interleave(count)
 
     def states(self, turn: Turn, name: str, cells: int) -> Any:
         """Return the states of recurrent networks in a turn, float32 [C, K], or [C, S, K] of teams, in the
@@ -149,8 +168,7 @@ class Lanes(Value, stored=False):
 
     def next_observations(self, turn: Turn) -> Tensor:
         """Return what lanes observe after a turn, [L, W, *observation_shape], or [L, W, S, ...] of teams."""
-        observation = torch.as_tensor(turn.next_agents["observation"])[:, list(self.agents)]
-        return self.by_lane(observation.reshape(-1, *self.members, *self.spaces.observation_shape))
+        return self.by_lane(self._by_column(turn.next_agents["observation"]))
 
     @property
     def columns(self) -> Tensor:

@@ -41,9 +41,7 @@ class Memory(Protocol):
     """The memory of lanes: it stores every turn, and yields batches when an update is due."""
 
     form: TransitionForm
-    """The shapes of what it stores of a turn."""
-    sequence_steps: int
-    """The consecutive turns in each sample; 1 if samples are single transitions."""
+    """The shapes of what it stores of a turn, and of what it samples."""
 
     def write(self, turn: Turn, lane_turn: LaneTurn) -> None:
         """Store a turn.
@@ -77,7 +75,8 @@ class Learner:
     """The learner of S agents of each of R replicas, by one algorithm.
 
     Each lane has its own network, targets, optimiser state, memory and random numbers, and learns exactly as
-    it would alone. A `cprl.learners.protocol.AnyLearner`.
+    it would alone. The training loop calls `begin` once, then in each turn `store`, `update` and
+    `end_episode`.
 
     Args:
         algorithm: a `cprl.algorithms.Algorithm`, which makes the networks, the memory and the loss.
@@ -145,9 +144,9 @@ class Learner:
         """
         episodes_before = self._episodes
         self._episodes = episodes_before + ended.view(self.replicas, self.worlds).sum(1)
-        rule = self.lane_networks.rule
-        period = getattr(self.settings, "target_every_episodes", None)
-        if period is None or rule.tau is not None or rule.target_every_updates is not None:
+        settings = self.settings
+        period = getattr(settings, "target_every_episodes", None)
+        if period is None or settings.tau is not None or settings.target_every_updates is not None:
             return
         is_due = self._episodes // period > episodes_before // period
         if is_due.any():
@@ -174,7 +173,7 @@ class Learner:
         schedule = getattr(self.settings, "epsilon", None)
         epsilon = 0.0 if schedule is None else schedule(self.steps)  # stochastic policies have no epsilon
         self.actor.explore_with(epsilon)
-        if self.lane_networks.rule.decays:
+        if getattr(self.settings, "learning_rate_end", None) is not None:
             self.lane_networks.learning_rate = self.settings.learning_rate_at(self.steps)
         if getattr(self.algorithm, "entropy_coeff_end", None) is not None:
             self.lane_networks.set_entropy_coeff(self.algorithm.entropy_coeff_at(self.steps))

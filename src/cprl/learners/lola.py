@@ -173,7 +173,7 @@ class LOLANetworks(nn.Module):
     def finite(self) -> Tensor:
         """Return for each lane whether its weights and optimiser state are finite, bool [R x S]."""
         states = {weight: state for optimizer in self.optimizers for weight, state in optimizer.state.items()}
-        stacks = [self.actors, self.critics, self.players, *([] if self.ahead is None else [self.ahead])]
+        stacks = [stack for stack in self.children() if isinstance(stack, Members)]
         are_finite = []
         for agent in range(len(self.actors)):
             weights = [weight for stack in stacks for weight in stack[agent].parameters()]
@@ -201,8 +201,6 @@ class LOLARollouts:
     Args:
         rollouts: the number of rollouts P.
     """
-
-    sequence_steps: Final = 1
 
     def __init__(self, lanes: Lanes, settings: LOLASettings, network: nn.Module, *, rollouts: int) -> None:
         refuse_other_networks(network)

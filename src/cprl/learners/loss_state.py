@@ -4,48 +4,22 @@ Such state has to be stored for each lane and in checkpoints, or refused: else l
 resumed training would differ.
 """
 
-from collections.abc import Callable, Iterator
-from typing import Any, Final, NamedTuple
+from collections.abc import Callable
+from io import BytesIO
+from pickle import Pickler
+from types import FunctionType
+from typing import Any, Final
 
-import numpy as np
 import torch
 from tensordict import is_tensor_collection
 from tensordict.nn import TensorDictParams
 from torch import Tensor, nn
 from torchrl.objectives import LossModule
 
-from cprl.objectives.functional import named_weights
+from cprl.objectives.functional import STATE_TYPES, named_weights
 
 _CHANGED_BY_TORCH: Final = frozenset({*vars(nn.Module()), "_cache"})
 """Attributes of modules that torch and TorchRL themselves change in a call."""
-_NUMBERS: Final = bool | int | float
-"""The types of plain numbers."""
-
-
-class _Entry(NamedTuple):
-    """A buffer or an attribute of a loss, with its content at the time it was read."""
-
-    value: Any
-    """The object itself, which later calls may change."""
-    is_buffer: bool
-    content: Any
-    """A copy of what the object holds, compared by ==, see `_content`."""
-
-    def can_become(self, after: "_Entry") -> bool:
-        """Return whether a learner can store the change from this entry to another, for each lane."""
-        value = after.value
-        if (
-            self.is_buffer
-            and after.is_buffer
-            and isinstance(value, Tensor)
-            and isinstance(self.value, Tensor)
-        ):
-            return self.value.shape == value.shape and self.value.dtype == value.dtype
-        return isinstance(value, _NUMBERS | Tensor) and not after.is_buffer
-
-
-_NO_ENTRY: Final = _Entry(None, False, None)
-"""In place of an entry that does not exist before or after a call."""
 
 
 def changed_state(loss: LossModule, call: Callable[[], Any]) -> list[str]:
@@ -63,86 +37,100 @@ def changed_state(loss: LossModule, call: Callable[[], Any]) -> list[str]:
     Raises:
         ValueError: if anything else changes, or a buffer is new or changes its size.
     """
-    state = _state_of(loss)
+    sizes = _buffer_sizes(loss)
+    contents = _contents(loss)
     changed = set()
     for _ in range(2):
-        state_before = state
+        contents_before = contents
         call()
-        state = _state_of(loss)
-        for name in sorted(state_before.keys() | state.keys()):
-            before = state_before.get(name, _NO_ENTRY)
-            after = state.get(name, _NO_ENTRY)
-            if before.content == after.content:
-                continue
-            is_of_submodule = "." in name
-            if (is_of_submodule and not after.is_buffer) or not before.can_become(after):
-                kind = "buffer that comes or grows" if after.is_buffer else type(after.value).__name__
-                raise ValueError(
-                    f"the loss {type(loss).__name__} keeps its {name}, a {kind}, from call to call, which no "
-                    "checkpoint has; allowed: buffers of one size, and attributes of the loss itself that "
-                    "are numbers or tensors"
-                )
-            changed.add(name)
+        contents = _contents(loss)
+        names = contents_before.keys() | contents.keys()
+        changed |= {name for name in names if contents_before.get(name) != contents.get(name)}
+    new_sizes = _buffer_sizes(loss)
+    for name in sorted(changed):
+        if name in new_sizes:
+            kind = "buffer that comes or grows"
+            is_stored = sizes.get(name) == new_sizes[name]
+        else:
+            value = _state_of(loss).get(name)
+            kind = type(value).__name__
+            is_stored = "." not in name and isinstance(value, STATE_TYPES)
+        if not is_stored:
+            raise ValueError(
+                f"the loss {type(loss).__name__} keeps its {name}, a {kind}, from call to call, which no "
+                "checkpoint has; allowed: buffers of one size, and attributes of the loss itself that "
+                "are numbers or tensors"
+            )
     return sorted(changed)
 
 
-def _state_of(loss: LossModule) -> dict[str, _Entry]:
+def _buffer_sizes(loss: LossModule) -> dict[str, tuple[torch.Size, torch.dtype]]:
+    """Return the shape and the dtype of each buffer of a loss and its submodules, by name."""
+    buffers = loss.named_buffers(remove_duplicate=False)
+    return {name: (buffer.shape, buffer.dtype) for name, buffer in buffers}
+
+
+def _state_of(loss: LossModule) -> dict[str, Any]:
     """Return the buffers and attributes of a loss and its submodules, by name."""
     modules = dict(loss.named_modules())
-    # Modules count as met: each is compared under its own name, and not wherever an attribute refers to it.
-    met_modules = {id(module): (number, module) for number, module in enumerate(modules.values())}
-    weights = {value.data_ptr() for value in named_weights(loss).values()}
+    groups = tuple(f"{path}." for path, module in modules.items() if isinstance(module, TensorDictParams))
     state = {}
     for path, module in modules.items():
-        if any(isinstance(modules[outer], TensorDictParams) for outer in _outer_paths(path)):
+        if f"{path}.".startswith(groups):
             continue  # weights
         attributes = {name: value for name, value in vars(module).items() if name not in _CHANGED_BY_TORCH}
         buffers = dict(module.named_buffers(recurse=False, remove_duplicate=False))
         for name, value in {**attributes, **buffers}.items():
-            content = _content(value, weights, dict(met_modules))
-            state[f"{path}.{name}".removeprefix(".")] = _Entry(value, name in buffers, content)
+            state[f"{path}.{name}".removeprefix(".")] = value
     return state
 
 
-def _outer_paths(path: str) -> list[str]:
-    """Return the names of a module and of all modules that contain it, e.g. "a" and "a.b" for "a.b"."""
-    names = path.split(".")
-    return [".".join(names[:depth]) for depth in range(1, len(names) + 1)]
+def _contents(loss: LossModule) -> dict[str, bytes]:
+    """Return what the buffers and attributes of a loss and its submodules hold, by name, see `_content`."""
+    # Each module is compared under its own name, and not wherever an attribute refers to it.
+    module_ids = {id(module) for module in loss.modules()}
+    weights = {value.data_ptr() for value in named_weights(loss).values()}
+    return {name: _content(value, module_ids, weights) for name, value in _state_of(loss).items()}
 
 
-def _content(value: Any, weights: set[int], met: dict[int, tuple[int, Any]]) -> Any:
-    """Return the content of a value, recursively, in a form that is compared by ==.
+def _content(value: Any, module_ids: set[int], weights: set[int]) -> bytes:
+    """Return what a value holds, recursively, as bytes that are equal if the contents are."""
+    file = BytesIO()
+    _ContentPickler(file, module_ids, weights).dump(value)
+    return file.getvalue()
+
+
+class _ContentPickler(Pickler):
+    """Pickles what an object holds: the numbers of its tensors, but those of weights, and the state of all
+    other objects; those that pickle refuses, such as functions, count by their identity.
 
     Args:
+        module_ids: the ids of modules that are left out.
         weights: the addresses of the learner's weights, which are left out.
-        met: the objects that were met before, by id, each with its number; an object that is met again, such
-            as one that contains itself, is replaced by its number.
     """
-    if value is None or isinstance(value, str | bytes):
-        return value
-    if isinstance(value, _NUMBERS | complex):
-        return repr(value)  # NaN equals itself
-    if id(value) in met:
-        return met[id(value)][0]
-    met[id(value)] = len(met), value
-    if isinstance(value, Tensor):
+
+    def __init__(self, file: BytesIO, module_ids: set[int], weights: set[int]) -> None:
+        super().__init__(file)
+        self._module_ids = module_ids
+        self._weights = weights
+
+    def persistent_id(self, value: Any) -> Any:
+        """Return what is written in place of an object; None to write the object."""
+        if isinstance(value, TensorDictParams | type | FunctionType) or id(value) in self._module_ids:
+            return id(value)
+        if is_tensor_collection(value):
+            return dict(value.items())
+        if not isinstance(value, Tensor):
+            return None
         plain = value.detach()
-        is_left_out = plain.is_meta or plain.layout != torch.strided or plain.data_ptr() in weights
+        is_left_out = plain.is_meta or plain.layout != torch.strided or plain.data_ptr() in self._weights
         numbers = None if is_left_out else plain.cpu().flatten().view(torch.uint8).numpy().tobytes()
-        return plain.shape, plain.dtype, numbers
-    if isinstance(value, np.ndarray) and value.dtype != object:
-        return value.shape, value.dtype, value.tobytes()
-    if isinstance(value, TensorDictParams):
-        return None
-    if isinstance(value, dict) or is_tensor_collection(value):
-        return [(_content(name, weights, met), _content(item, weights, met)) for name, item in value.items()]
-    if isinstance(value, list | tuple):
-        return [_content(item, weights, met) for item in value]
-    if isinstance(value, set | frozenset):
-        return value.copy()
-    try:
-        rebuild, *state = value.__reduce_ex__(2)
-    except Exception:  # pickle does not take classes, functions and others, and an object may raise anything
-        return id(value)
-    parts = [list(part) if isinstance(part, Iterator) else part for part in state]
-    return getattr(rebuild, "__qualname__", ""), [_content(part, weights, met) for part in parts]
+        return tuple(plain.shape), str(plain.dtype), numbers
+
+    def reducer_override(self, value: Any) -> Any:
+        """Return how an object is rebuilt of its state; for one that pickle refuses, of its identity."""
+        try:
+            reduced = value.__reduce_ex__(2)
+        except Exception:  # of a user's object, which may raise anything
+            reduced = None
+        return reduced if isinstance(reduced, tuple) else (int, (id(value),))

@@ -12,6 +12,7 @@ from typing import Any, Final, Literal, TypeAlias
 import torch
 from tensordict import TensorDict
 from torch import Tensor, nn
+from torch.utils._pytree import tree_map
 from torchrl.objectives import LossModule
 
 from cprl.learners.draw import Draw
@@ -110,9 +111,16 @@ class LaneNetworks:
         for lane_loss in losses:
             mark_targets_updated(lane_loss)
         self.losses = [FunctionalLoss(lane_loss) for lane_loss in losses]
-        self._names = tuple(self.params)
-        self._target_names = tuple(self.targets)
+        params = list(self.params)
+        self._names = (*self.params, *self.targets)
+        self._followed = [
+            (position, params.index(_source(name)))
+            for position, name in enumerate(self.targets)
+            if _source(name) in self.params
+        ]
+        """The positions of each target and of the weights that it follows, among targets and params."""
         self._tensors = [list(group.values()) for group in self._groups().values()]
+        """Params, targets, means and squares, each in the order of their names."""
         self.learning_rate = rule.learning_rate
         """The learning rate of the next step."""
         self._scalars = [self._tensors[0][0].new_zeros(()) for _ in range(3)]
@@ -174,9 +182,8 @@ class LaneNetworks:
             self.rule, params, gradients, means, squares, rate=rate, step_size=step_size, scale=scale
         )
         if self.rule.tau is not None:
-            for name, target in zip(self._target_names, targets, strict=True):
-                if _source(name) in self._names:
-                    target.lerp_(params[self._names.index(_source(name))], self.rule.tau)
+            for target, source in self._followed:
+                targets[target].lerp_(params[source], self.rule.tau)
         return losses
 
     def _gradients(
@@ -188,27 +195,12 @@ class LaneNetworks:
             results = [
                 self._single_gradient(index, params, targets, batch) for index in range(len(self.losses))
             ]
-            gradients_by_network, losses_by_network = zip(*results, strict=True)
-            by_weight = zip(*gradients_by_network, strict=True)
-            return [torch.stack(gradients) for gradients in by_weight], torch.stack(losses_by_network)
+            return _stack(results)
         gradient_function = torch.func.grad(self._total_loss, has_aux=True)
         if self.update == "vmapped":
             gradient_function = torch.vmap(gradient_function)
         gradients, losses = gradient_function(params, targets, batch)
         return gradients, losses
-
-    def _total_loss(
-        self, params: list[Tensor], targets: list[Tensor], batch: TensorDict
-    ) -> tuple[Tensor, Tensor]:
-        """Return the sum of the losses of all networks, which is differentiated, and the loss of each.
-
-        Losses are averaged over the batch and summed over networks, so that the gradient of each network
-        depends on its own loss alone.
-        """
-        transition_losses = self._transition_losses(0, params, targets, batch)
-        is_single = self.update == "vmapped"
-        losses = _mean_loss(transition_losses, batch, is_single=is_single) * self.rule.loss_share
-        return losses.sum(), losses
 
     def _single_gradient(
         self, index: int, params: list[Tensor], targets: list[Tensor], batch: TensorDict
@@ -216,18 +208,26 @@ class LaneNetworks:
         """Return the gradient and the loss of one network, for the update "list"."""
         weights = [value[index].detach().requires_grad_() for value in params]
         target_weights = [value[index] for value in targets]
-        transition_losses = self._transition_losses(index, weights, target_weights, batch[index])
-        loss = _mean_loss(transition_losses, batch[index], is_single=True) * self.rule.loss_share
+        loss, _ = self._total_loss(weights, target_weights, batch[index], index)
         gradients = torch.autograd.grad(loss, weights, allow_unused=True, materialize_grads=True)
         return gradients, loss.detach()
 
-    def _transition_losses(
-        self, index: int, params: list[Tensor], targets: list[Tensor], batch: TensorDict
-    ) -> Tensor:
-        """Return the loss of each transition by one of the loss functions, see `FunctionalLoss`."""
-        weights = dict(zip(self._names, params, strict=True))
-        target_weights = dict(zip(self._target_names, targets, strict=True))
-        return self.losses[index](weights, target_weights, batch)
+    def _total_loss(
+        self, params: list[Tensor], targets: list[Tensor], batch: TensorDict, index: int = 0
+    ) -> tuple[Tensor, Tensor]:
+        """Return the sum of the losses of all networks, which is differentiated, and the loss of each.
+
+        Losses are averaged over the batch and summed over networks, so that the gradient of each network
+        depends on its own loss alone.
+
+        Args:
+            index: the index of the loss function.
+        """
+        weights = dict(zip(self._names, (*params, *targets), strict=True))
+        transition_losses = self.losses[index](weights, batch)
+        is_single = self.update != "stacked"
+        losses = _mean_loss(transition_losses, batch, is_single=is_single) * self.rule.loss_share
+        return losses.sum(), losses
 
     def _by_network(self, batch: TensorDict) -> TensorDict:
         """Reshape a batch of lanes, [L, b], to one of networks, [L / S, S x b]."""
@@ -280,9 +280,7 @@ class LaneNetworks:
         for index, lane_inputs in enumerate(zip(*inputs, strict=True)):
             lane_weights = {key: value[index] for key, value in weights.items()}
             results.append(call_network(lane_weights, *lane_inputs))
-        if isinstance(results[0], tuple):
-            return tuple(torch.stack(by_lane) for by_lane in zip(*results, strict=True))
-        return torch.stack(results)
+        return _stack(results)
 
     def _part_weights(self, part_name: str) -> Weights:
         """Return the weights of one network of an agent, by their names in it."""
@@ -292,9 +290,9 @@ class LaneNetworks:
 
     def copy_to_targets(self, marked: Tensor) -> None:
         """Copy the weights of the marked networks, bool [L / S], to their targets."""
-        for name, target in self.targets.items():
-            if _source(name) in self.params:
-                target[marked] = self.params[_source(name)][marked]
+        params, targets, *_ = self._tensors
+        for target, source in self._followed:
+            targets[target][marked] = params[source][marked]
 
     def network_state(self, index: int) -> Weights:
         """Return copies of the current weights of an acting network, 0 to L / S - 1, as its state dict."""
@@ -343,6 +341,11 @@ class LaneNetworks:
         for loss, call_state in zip(self.losses, state["losses"], strict=False):
             loss.load_call_state(call_state)
         self.updates = int(state["updates"])
+
+
+def _stack(results: Sequence[Any]) -> Any:
+    """Return the results of all networks as one, whose tensors have the lane axis in front."""
+    return tree_map(lambda *tensors: torch.stack(tensors), *results)
 
 
 def _outputs_of_both(networks: LaneNetworks, observation: Tensor) -> list[Tensor]:

@@ -27,9 +27,9 @@ from torchrl.objectives import HardUpdate, LossModule, SoftUpdate
 from torchrl.objectives.value import GAE
 
 from cprl.learners.lanes import Lanes
+from cprl.learners.learner import Learner
 from cprl.learners.networks import MakeLoss
 from cprl.learners.optimizers import UpdateRule, torch_optimizer
-from cprl.learners.protocol import AnyLearner
 from cprl.learners.replay import Replay
 from cprl.learners.ring import Noise, stored_bytes
 from cprl.learners.rollouts import ACTOR, Rollouts
@@ -43,7 +43,7 @@ from cprl.policies.rng import Purpose, seed_of
 from cprl.system.memory import check_memory
 
 
-def train_plainly(env: EnvBase, learner: AnyLearner, *, episodes: int) -> None:
+def train_plainly(env: EnvBase, learner: Learner, *, episodes: int) -> None:
     """Train all agents of a game.
 
     Args:

@@ -8,8 +8,7 @@ from tensordict import TensorDict
 from torch import Tensor
 from torchrl.objectives import LossModule
 
-from cprl import recurrent_state
-from cprl.keys import Turn
+from cprl.keys import Turn, recurrent_state
 from cprl.learners.draw import Draw
 from cprl.learners.lanes import Lanes
 from cprl.learners.networks import LaneNetworks
@@ -45,7 +44,6 @@ class Replay:
         self.settings = settings
         self.form = form
         self.stochastic = stochastic
-        self.sequence_steps = settings.sequence_steps
         self._refuse_other_sequences()
         refuse_for_replay(loss, settings, lambda: self.example(1)[0])
         self.buffer = self._make_buffer()
@@ -59,7 +57,7 @@ class Replay:
 
     def _refuse_other_sequences(self) -> None:
         """Raise a ValueError unless recurrent networks, and they alone, learn from sequences."""
-        steps = self.sequence_steps
+        steps = self.settings.sequence_steps
         is_recurrent = self.form.state_cells > 0
         if is_recurrent != (steps > 1):
             kind, allowed = ("a", "2 or more") if is_recurrent else ("no", "1")
@@ -110,11 +108,7 @@ class Replay:
         ring = Ring(
             form, seeds=seeds, transitions=turns, batch_size=_EXAMPLE_SAMPLES, device=self.lanes.device
         )
-        places = torch.arange(_EXAMPLE_SAMPLES, device=ring.device).expand(lanes, -1)
-        batch = ring.get(places)
-        if form.noise_shape:
-            batch.set("noise", torch.zeros(*batch.batch_size, *form.noise_shape, device=ring.device))
-        return randomized(batch, self.lanes.spaces.actions)
+        return randomized(ring.sample(), self.lanes.spaces.actions)
 
     def values(self, networks: LaneNetworks, turn: Turn) -> Tensor:
         """Return the highest action value after a turn, [L, W, ..]; NaN for networks that output a policy."""

@@ -19,16 +19,16 @@ import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from cprl import recurrent_state
+from cprl.keys import recurrent_state
 from cprl.learners.draw import Draw
-from cprl.learners.transitions import Horizon, LaneTurn, TransitionForm, array_of, refuse_other_dtype
+from cprl.learners.transitions import Horizon, LaneTurn, Sizes, TransitionForm, array_of, refuse_other_dtype
 from cprl.policies.rng import DRAWN_AHEAD, LaneRng
 from cprl.system.memory import check_memory, free_bytes
 
-_FIELDS: Final = ("observation", "action", "reward", "done", "terminated", "row")
-"""The names of the fields of every ring, in the order in which it holds them."""
 _STATE: Final = recurrent_state.AFTER
 """The name of the field with recurrent states, which a ring for sequences has besides."""
+_ROW_FIELDS: Final = ("observation", _STATE)
+"""The names of the fields that have rows of their own, see `Ring.fields`."""
 
 Fields = dict[str, Tensor]
 """The fields of a ring by name, see `Ring.fields`."""
@@ -97,20 +97,26 @@ def _select_rows(field: Tensor, column: Tensor, row: Tensor, rows: int) -> Tenso
 
 
 class _Gather(NamedTuple):
-    """A function that gathers the transitions of a `Draw`: `gather` with what does not change filled in."""
+    """A function that gathers the batch of a `Draw`: `gather`, or `sequences`, with what does not change
+    filled in."""
 
+    names: tuple[str, ...]
+    """The names of the fields of the ring, in the order in which it holds them."""
     rows: int
     horizon: Horizon | None
+    sequence_steps: int
 
     def __call__(self, columns: Sequence[Tensor]) -> TensorDict:
-        """Return the transitions, [L, b].
+        """Return the transitions, [L, b], or the sequences that begin with them, [L, b, T].
 
         Args:
-            columns: the fields of the ring in the order of `_FIELDS`, then the places of the transitions,
-                their columns, and, for losses that sample, uniform numbers.
+            columns: the fields of the ring, then the places of the transitions, their columns, and, for
+                losses that sample, uniform numbers.
         """
-        index, column, *noise = columns[len(_FIELDS) :]
-        fields = dict(zip(_FIELDS, columns, strict=False))
+        fields = dict(zip(self.names, columns, strict=False))
+        index, column, *noise = columns[len(fields) :]
+        if self.sequence_steps > 1:
+            return sequences(fields, index, column, self.rows, self.sequence_steps)
         return gather(fields, index, column, self.rows, self.horizon, *noise)
 
 
@@ -188,13 +194,23 @@ def _rows_per_column(turns: int) -> int:
     return turns + max(8, round(turns * SPARE_ROWS_SHARE)) + 2 * CHECK_EVERY_TURNS + 2
 
 
+def _sizes(form: TransitionForm, columns: int, turns: int) -> Sizes:
+    """Return the shape and the dtype of each field of a ring, see `Ring.fields`."""
+    fields = form.fields
+    del fields["next_observation"]  # it is the observation of the next row
+    fields["row"] = (), torch.int64
+    if form.state_cells:
+        fields[_STATE] = (form.state_cells,), torch.float32
+    sizes = {}
+    for name, (shape, dtype) in fields.items():
+        axes = (columns * _rows_per_column(turns),) if name in _ROW_FIELDS else (turns, columns)
+        sizes[name] = (*axes, *shape), dtype
+    return sizes
+
+
 def stored_bytes(form: TransitionForm, columns: int, turns: int) -> int:
     """Return the bytes that a ring of some columns and turns takes."""
-    bytes_per_row = prod(form.observation_shape) * form.dtype.itemsize + 4 * form.state_cells
-    action_bytes = 8 * prod(form.action_shape)
-    reward_bytes = 4 * prod(form.reward_shape)
-    bytes_per_turn = action_bytes + reward_bytes + 8 + 1 + 1  # the row, and two flags
-    return columns * (_rows_per_column(turns) * bytes_per_row + turns * bytes_per_turn)
+    return sum(prod(shape) * dtype.itemsize for shape, dtype in _sizes(form, columns, turns).values())
 
 
 def steps_per_block(count: int) -> int:
@@ -257,8 +273,6 @@ class Ring:
         noise_seeds: Sequence[Sequence[int]] | None = None,
         device: str | torch.device = "cpu",
     ) -> None:
-        self.horizon = form.horizon
-        self.sequence_steps = form.sequence_steps
         self.device = torch.device(device)
         columns = torch.arange(len(seeds))[:, None] if columns is None else columns
         self.columns = columns.to(self.device)
@@ -270,15 +284,17 @@ class Ring:
         """The observation rows of each column."""
         self._steps_ahead = form.steps_ahead
         _refuse_too_large(form, lanes, self.worlds, self.capacity, self.device)
-        self.fields = _new_fields(form, column_count, self.rows, self.capacity, self.device)
+        sizes = _sizes(form, column_count, self.capacity)
+        self.sizes = tuple(sizes.values())
+        """The shapes and dtypes of the fields."""
+        self.fields = {name: _zeros(shape, dtype, self.device) for name, (shape, dtype) in sizes.items()}
         """Observations [C x rows, ...], actions and rewards [T, C, ...], flags [T, C].
 
         "row", [T, C], counts the rows that a column has written; the observation before a turn has this row,
         that after it the next one. A recurrent state, [C x rows, K], has the row of the observation before
         the turn in which the agent acted with it."""
-        self.sizes = tuple((field.shape, field.dtype) for field in self.fields.values())
-        """The shapes and dtypes of the fields."""
-        self._row_fields = [name for name in self.fields if name in ("observation", _STATE)]
+        self._gather = _Gather(tuple(sizes), self.rows, form.horizon, form.sequence_steps)
+        self._row_fields = [name for name in self.fields if name in _ROW_FIELDS]
         # Turns are written with numpy on the CPU: for so few numbers torch takes five times as long.
         self._arrays = {name: array_of(field) for name, field in self.fields.items()}
         self._column = array_of(torch.arange(column_count, device=self.device))
@@ -380,26 +396,20 @@ class Ring:
             column: their columns, int64 [L, b] or [L, 1]; by default those of each lane's first world.
         """
         column = self.columns[:, :1] if column is None else column
-        if self.sequence_steps > 1:
-            return sequences(self.fields, index, column, self.rows, self.sequence_steps)
-        return gather(self.fields, index, column, self.rows, self.horizon)
+        return self._gather([*self.fields.values(), index, column])
 
     def sample(self) -> TensorDict:
         """Return the next sample: transitions [L, b], or sequences [L, b, T]; with the entry "noise" for
         losses that sample."""
-        batch = self.get(*self.places())
-        if self.noise is not None:
-            batch.set("noise", self.noise.next())
-        return batch
+        draw = self.draw()
+        return draw.gather(draw.columns)
 
     def draw(self) -> Draw:
-        """Return the next sample as a `Draw`: the update gathers it itself, unless it has sequences."""
-        if self.sequence_steps > 1:
-            return Draw.of(self.sample())
+        """Return the next sample as a `Draw`, which the update gathers itself."""
         index, column = self.places()
         noise = [] if self.noise is None else [self.noise.next()]
         columns = [*self.fields.values(), index, column, *noise]
-        return Draw(_Gather(self.rows, self.horizon), columns, (self.sizes, index.shape))
+        return Draw(self._gather, columns, (self.sizes, index.shape))
 
     def state_dict(self) -> dict[str, Any]:
         """Return the written part of all fields, and the states of the random generators.
@@ -459,21 +469,6 @@ def _refuse_too_large(
         needed = needed_bytes / 2**30
         free = free_bytes(device) / 2**30
         logging.getLogger("cprl").info("Replay buffers of %s: %.2f GiB of %.1f GiB free", size, needed, free)
-
-
-def _new_fields(form: TransitionForm, columns: int, rows: int, turns: int, device: torch.device) -> Fields:
-    """Return the fields of an empty ring, see `Ring.fields`."""
-    shapes: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-        "observation": ((columns * rows, *form.observation_shape), form.dtype),
-        "action": ((turns, columns, *form.action_shape), torch.int64),
-        "reward": ((turns, columns, *form.reward_shape), torch.float32),
-        "done": ((turns, columns), torch.bool),
-        "terminated": ((turns, columns), torch.bool),
-        "row": ((turns, columns), torch.int64),
-    }
-    if form.state_cells:
-        shapes[_STATE] = ((columns * rows, form.state_cells), torch.float32)
-    return {name: _zeros(shape, dtype, device) for name, (shape, dtype) in shapes.items()}
 
 
 def _zeros(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:

@@ -9,8 +9,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.value.functional import generalized_advantage_estimate
 
-from cprl import recurrent_state
-from cprl.keys import Turn
+from cprl.keys import Turn, recurrent_state
 from cprl.learners.draw import Draw
 from cprl.learners.lanes import Lanes
 from cprl.learners.networks import LaneNetworks
@@ -39,16 +38,15 @@ def state_shapes(network: nn.Module) -> dict[str, tuple[int, ...]]:
     Raises:
         ValueError: if only one of them is recurrent.
     """
-    parts = list(networks_by_name(network).items())[:2]
-    shapes = [state_shape_of(part) for _, part in parts]
-    if all(shape is None for shape in shapes):
-        return {}
-    for (name, _), shape in zip(parts, shapes, strict=True):
-        if shape is None:
-            raise ValueError(
-                f'the "{name}" is not recurrent; allowed beside a network that is: a GRU or an LSTM'
-            )
-    return {name: shape for name, shape in zip(STATE_NAMES, shapes, strict=True) if shape is not None}
+    shapes: dict[str, Any] = {}
+    for name in ("actor", "critic"):
+        shapes[name] = state_shape_of(networks_by_name(network)[name])
+    stateless = [name for name, shape in shapes.items() if shape is None]
+    if len(stateless) == 1:
+        raise ValueError(
+            f'the "{stateless[0]}" is not recurrent; allowed beside a network that is: a GRU or an LSTM'
+        )
+    return {} if stateless else dict(zip(STATE_NAMES, shapes.values(), strict=True))
 
 
 class States:
@@ -177,10 +175,11 @@ class Rollouts:
         self._reads_logits = reads(loss, "logits")
         shapes = state_shapes(network)
         turns = min(settings.minibatch_size, settings.rollout_steps)
-        self.sequence_steps = turns if shapes else 1
-        """The consecutive turns T' of each sequence; 1 if no network is recurrent."""
-        cells = shapes[STATE_NAMES[ACTOR]][-1] if shapes else 0
-        self.form = lanes.form(state_cells=cells, has_in_play=settings.only_in_play)
+        self.form = lanes.form(
+            state_cells=shapes[STATE_NAMES[ACTOR]][-1] if shapes else 0,
+            sequence_steps=turns if shapes else 1,
+            has_in_play=settings.only_in_play,
+        )
         self.states = States(shapes, lanes, sequence_steps=turns) if shapes else None
         self.rollout = Rollout(lanes, settings.rollout_steps, self.form)
         steps = settings.rollout_steps * lanes.worlds
@@ -206,29 +205,22 @@ class Rollouts:
     def example(self, lanes: int) -> TensorDict:
         """Return a synthetic minibatch of a number of lanes, in the shapes of those that `due` yields."""
         settings = self.settings
-        form = self.form
         steps = min(settings.minibatch_size, settings.rollout_steps * self.lanes.worlds)
-        size = [lanes, steps if self.states is None else self.sequence_steps]
-
-        def zeros(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
-            return torch.zeros(*size, *shape, dtype=dtype, device=self.lanes.device)
-
-        members = form.action_shape
+        size = lanes, 1, steps if self.states is None else self.form.sequence_steps
+        device = self.lanes.device
         actions = self.lanes.spaces.actions
-        entries = {
-            "observation": zeros(*form.observation_shape, dtype=form.dtype),
-            "action": zeros(*members, dtype=torch.int64),
-            "action_log_prob": zeros(*members),
-            **{name: zeros(*members, 1) for name in ("advantage", "value_target", "state_value")},
+        columns = {
+            name: torch.zeros(*size, *shape, dtype=dtype, device=device)
+            for name, (shape, dtype) in self.form.fields.items()
         }
-        if self._reads_logits:
-            entries["logits"] = zeros(*members, actions)
-        if form.has_in_play:
-            entries["in_play"] = ~zeros(*members, dtype=torch.bool)
+        logits = torch.zeros(*size, *self.form.action_shape, actions, device=device)
+        value = logits[..., :1]
+        states: dict[str, Tensor] = {}
         if self.states is not None:
-            entries |= {name: zeros(*shape) for name, shape in self.states.shapes.items()}
-            entries["is_init"] = zeros(dtype=torch.bool)
-        return randomized(TensorDict(entries, size), actions)
+            for name, shape in self.states.shapes.items():
+                states[name] = torch.zeros(*size, *shape, device=device)
+            states["is_init"] = torch.zeros(size, dtype=torch.bool, device=device)
+        return randomized(self._entries(columns, logits, value, value, states), actions)
 
     def _minibatches(self, numbers: Tensor) -> Tensor:
         """Return the steps of each minibatch of an epoch.
@@ -241,7 +233,7 @@ class Rollouts:
             [minibatches, L, sequences, T'] if a minibatch has several sequences of each lane.
         """
         size = self.settings.minibatch_size
-        turns = self.sequence_steps
+        turns = self.form.sequence_steps
         if self.states is None:
             return numbers.argsort(-1).view(len(numbers), -1, size).transpose(0, 1)
         sequences = numbers[:, ::turns].argsort(-1).view(len(numbers), -1, size // turns).transpose(0, 1)
@@ -250,22 +242,39 @@ class Rollouts:
 
     @torch.no_grad()
     def _batch(self, networks: LaneNetworks) -> TensorDict:
-        """Return the rollout with advantages, [L, W x T], under the keys of TorchRL's losses.
+        """Return the rollout with advantages, [L, W x T], under the keys of TorchRL's losses."""
+        columns = self.rollout.fields
+        if self.states is not None:
+            return self._entries(columns, *self.states.evaluate(networks, columns))
+        return self._entries(columns, *self._evaluate(networks), {})
+
+    def _entries(
+        self,
+        columns: Mapping[str, Tensor],
+        logits: Tensor,
+        value: Tensor,
+        next_value: Tensor,
+        states: Mapping[str, Tensor],
+    ) -> TensorDict:
+        """Return rollouts with what actor and critic say of them, [L, W, T, ...], as one batch of steps, [L,
+        W x T].
 
         If the settings say so, advantages are normalised within each lane.
+
+        Args:
+            columns: the fields of the rollouts.
+            logits: the outputs of the actor.
+            value: the values of the states before each step.
+            next_value: the values of the states after each step.
+            states: the entries that losses of recurrent networks read besides.
         """
-        columns = self.rollout.fields
-        entries: dict[str, Tensor] = {}
-        if self.states is not None:
-            logits, value, next_value, entries = self.states.evaluate(networks, columns)
-        else:
-            logits, value, next_value = self._evaluate(networks)
         all_but_lanes = tuple(range(1, value.ndim))
         advantage, target = advantages(
             columns, value, next_value, settings=self.settings, over=all_but_lanes, time_dim=2
         )
         log_probs = logits.log_softmax(-1).gather(-1, columns["action"].unsqueeze(-1)).squeeze(-1)
-        entries |= {
+        entries = {
+            **states,
             "observation": columns["observation"],
             "action": columns["action"],
             "action_log_prob": log_probs,
@@ -277,8 +286,10 @@ class Rollouts:
             entries["logits"] = logits
         if self.form.has_in_play:
             entries["in_play"] = columns["in_play"]
-        size = [len(self.lanes), self.lanes.worlds * self.settings.rollout_steps]
-        return TensorDict({name: entry.flatten(1, 2) for name, entry in entries.items()}, size)
+        lanes, worlds, steps = columns["done"].shape
+        return TensorDict(
+            {name: entry.flatten(1, 2) for name, entry in entries.items()}, [lanes, worlds * steps]
+        )
 
     def _evaluate(self, networks: LaneNetworks) -> tuple[Tensor, Tensor, Tensor]:
         """Return the logits, values and next values of a full rollout, [L, W, T, ...]."""
@@ -424,19 +435,9 @@ class Rollout:
         self._lanes = lanes
         rollout_axis = () if rollouts is None else (rollouts,)
         axes = (*rollout_axis, len(lanes), lanes.worlds, steps)
-        shapes: dict[str, tuple[tuple[int, ...], torch.dtype]] = {
-            "observation": (form.observation_shape, form.dtype),
-            "action": (form.action_shape, torch.int64),
-            "next_observation": (form.observation_shape, form.dtype),
-            "reward": (form.reward_shape, torch.float32),
-            "done": ((), torch.bool),
-            "terminated": ((), torch.bool),
-        }
-        if form.has_in_play:
-            shapes["in_play"] = (form.action_shape, torch.bool)
         self.fields = {
             name: torch.zeros((*axes, *shape), dtype=dtype, device=lanes.device)
-            for name, (shape, dtype) in shapes.items()
+            for name, (shape, dtype) in form.fields.items()
         }
         """The stored turns, [L, W, T, ...], or [P, L, W, T, ...]."""
         self.steps = steps

@@ -47,8 +47,8 @@ class EpsilonGreedy(Value, stored=False):
 
     def epsilon(self, step: int) -> float:
         """Return the probability of a random action at a step, counted from 0."""
-        decayed_share = min(1.0, max(0.0, (step - self.epsilon_hold_steps) / self.epsilon_decay_steps))
-        return self.epsilon_start + decayed_share * (self.epsilon_end - self.epsilon_start)
+        steps_of_decay = max(0, step - self.epsilon_hold_steps)
+        return along_line(self.epsilon_start, self.epsilon_end, steps_of_decay / self.epsilon_decay_steps)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -1,4 +1,4 @@
-"""TabularLearner: Q-learning with tables of action values, for boards small enough to tabulate.
+"""The memory and the tables of agents that learn by Q-learning in tables, on boards small enough to tabulate.
 
 This is algorithm 1 of the study.
 
@@ -15,115 +15,114 @@ is).
 """
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from tensordict import TensorDictBase
-from torch import Tensor, nn
+from torch import Tensor
 
-from cprl import keys
 from cprl.commons.spaces import Spaces
 from cprl.keys import Turn
 from cprl.learners.lanes import Lanes
 from cprl.learners.settings import TabularSettings
-from cprl.learners.transitions import lane_turn
-from cprl.objectives.rewards import RewardModel
-from cprl.policies.actors import LaneActor
-from cprl.policies.rng import Purpose
+from cprl.learners.transitions import LaneTurn
 from cprl.policies.tabular import NEVER_MET, QTables, TableNetwork, states_of
 
+_Arrays = dict[str, NDArray[Any]]
 
-class TabularLearner:
-    """The learner of S tabular agents of each of R replicas, each with its own table.
 
-    A `cprl.learners.protocol.AnyLearner`; its tables are in the CPU's memory.
+class TabularMemory:
+    """A memory of the turns that tables have not yet learned from.
 
-    Args:
-        lanes: the agents that learn. Its `start_from` has the tables with which agents start, whose values
-            count as never updated.
-        settings: the hyperparameters.
+    It finds the states of a turn in the tables when it stores the turn, and adds those that are new.
 
     Raises:
-        MemoryError: from `store`, if an agent visits more than `settings.max_states` states.
+        MemoryError: from `write`, if an agent visits more than `settings.max_states` states.
     """
 
     def __init__(self, lanes: Lanes, settings: TabularSettings) -> None:
         self.lanes = lanes
-        self.settings = settings
-        self.spaces = lanes.spaces
-        self.agents = lanes.agents
-        self.replicas = lanes.replicas
-        self.worlds = lanes.worlds
-        self.rewards = RewardModel(lanes.reward)
-        self.steps = 0
+        self.form = lanes.form()
         self.tables = QTables(len(lanes), lanes.spaces.actions, max_states=settings.max_states)
-        for lane, name in enumerate(lanes.names):
-            if name in lanes.start_from:
-                start = lanes.start_from[name]
-                self.tables.add_lane(lane, start["states"].numpy(), start["values"].numpy())
-        self.actor = self._actor(Purpose.EXPLORATION, worlds=self.worlds)
-        self.actor.epsilon = settings.epsilon(0)
-        self._columns = lanes.columns.T.numpy()
-        """The columns of a `LaneTurn` that hold the lanes of each world of the replicas, int64 [W, L]."""
-        lane_by_column = np.empty(self._columns.size, np.int64)
-        lane_by_column[self._columns] = np.arange(len(lanes))
+        columns = lanes.columns.numpy()
+        lane_by_column = np.empty(columns.size, np.int64)
+        lane_by_column[columns] = np.arange(len(lanes))[:, None]
         self._lane_by_column: list[int] = lane_by_column.tolist()
         """The lane of each column of a `LaneTurn`."""
-        self._turns: deque[dict[str, NDArray[Any]]] = deque()
+        self._turns: deque[_Arrays] = deque()
         """The turns that are stored and not yet learned from, oldest first."""
 
-    def __repr__(self) -> str:
-        return f"{type(self).__name__}(agents={self.agents}, replicas={self.replicas})"
-
-    def begin(self) -> None:
-        """Do nothing: stored turns do not refer to the turns after them."""
-
-    def end_episode(self, ended: Tensor) -> None:
-        """Do nothing: there are no targets."""
-
-    def _actor(self, purpose: Purpose, *, worlds: int) -> LaneActor:
-        """Return an actor of all agents, with random numbers for one purpose."""
-        seeds = self.lanes.seeds(purpose)
-        actions = self.spaces.actions
-        return LaneActor(self.tables.outputs, actions, seeds=seeds, agents=len(self.agents), worlds=worlds)
-
-    def evaluation_actor(self, worlds: int) -> LaneActor:
-        """Return an actor with the current tables and the exploration of evaluations."""
-        actor = self._actor(Purpose.EVALUATION, worlds=worlds)
-        actor.epsilon = self.settings.epsilon_evaluation
-        return actor
-
-    def store(self, batch: TensorDictBase | Turn) -> None:
-        """Store one turn of every world until `update` learns from it."""
-        turn = Turn.of(batch)
-        if isinstance(turn.next_world[keys.DONE], Tensor):  # on a GPU; tables are on the CPU
-            turn = Turn.of(turn.batch.cpu())
-        rewards = turn.next_agents["reward"][..., 0]
-        shaped = self.rewards.add(rewards, turn.next_world[keys.DONE][..., 0])
-        transitions = lane_turn(self.agents, turn, shaped)
-        rows = self.tables.find_or_add(states_of(transitions.observation), self._lane_by_column)
-        next_states = states_of(transitions.next_observation)
+    def write(self, turn: Turn, lane_turn: LaneTurn) -> None:
+        """Store a turn; `cprl.learners.learner.Memory.write` says the arguments."""
+        fields = {
+            name: torch.as_tensor(field).numpy(force=True)  # tables are on the CPU
+            for name, field in lane_turn._asdict().items()
+            if field is not None
+        }
+        rows = self.tables.find_or_add(states_of(fields["observation"]), self._lane_by_column)
+        next_states = states_of(fields["next_observation"])
         next_rows = np.full(len(rows), NEVER_MET, np.int64)  # terminal states have the value 0
-        continuing = np.flatnonzero(~transitions.terminated)
+        continuing = np.flatnonzero(~fields["terminated"])
         next_rows[continuing] = self.tables.find_or_add(
             [next_states[column] for column in continuing],
             [self._lane_by_column[column] for column in continuing],
         )
-        reward = transitions.reward.astype(np.float64)
-        action = transitions.action.copy()
+        reward = fields["reward"].astype(np.float64)
+        action = fields["action"].copy()
         self._turns.append({"row": rows, "action": action, "reward": reward, "next_row": next_rows})
-        self.steps += self.worlds
-        self.actor.epsilon = self.settings.epsilon(self.steps)
 
-    def update(self) -> Tensor | None:
-        """Learn from the oldest stored turn, one world after the other; return the mean squared errors,
-        [R, S], or None if no turn is stored."""
-        if not self._turns:
-            return None
-        turn = self._turns.popleft()
+    def due(self, networks: "TabularNetworks") -> Iterator[_Arrays]:
+        """Yield the oldest turn that is not yet learned from; none if there is none."""
+        if self._turns:
+            yield self._turns.popleft()
+
+    def values(self, networks: "TabularNetworks", turn: Turn) -> Tensor:
+        """Return the highest action value after a turn, [L, W]."""
+        return networks.outputs(self.lanes.next_observations(turn)).amax(-1)
+
+    def cut(self, networks: "TabularNetworks") -> None:
+        """Do nothing: stored turns do not refer to the turns after them."""
+
+    def state_dict(self) -> dict[str, Any]:
+        turns = []
+        for turn in self._turns:
+            turns.append({name: torch.from_numpy(array) for name, array in turn.items()})
+        return {"turns": turns}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        self._turns.clear()
+        for turn in state["turns"]:
+            self._turns.append({name: array.numpy().copy() for name, array in turn.items()})
+
+
+class TabularNetworks:
+    """The tables of all lanes in place of their networks.
+
+    Args:
+        networks: the tables with which lanes start, whose values count as never updated.
+        memory: their memory, which has the tables.
+    """
+
+    update = "list"
+
+    def __init__(
+        self, networks: Sequence[TableNetwork], memory: TabularMemory, settings: TabularSettings
+    ) -> None:
+        self.tables = memory.tables
+        self.settings = settings
+        self._columns = memory.lanes.columns.T.numpy()
+        """The columns of a `LaneTurn` that hold the lanes of each world of the replicas, int64 [W, L]."""
+        for lane, network in enumerate(networks):
+            self.tables.add_lane(lane, network.states.numpy(force=True), network.values.numpy(force=True))
+
+    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
+        """Return the action values of lanes, float64 [L, k, A]."""
+        return self.tables.outputs(observation)
+
+    def learn(self, turn: _Arrays) -> Tensor:
+        """Learn from a turn, one world after the other; return the mean squared errors, [L]."""
         values = self.tables.values
         errors = []
         for columns in self._columns:
@@ -132,67 +131,27 @@ class TabularLearner:
             target = turn["reward"][columns] + self.settings.gamma * values[turn["next_row"][columns]].max(1)
             errors.append(target - values[index])
             values[index] += self.settings.rates(self.tables.visits[index]) * errors[-1]
-        squares = np.square(errors).mean(0)
-        return torch.from_numpy(squares).view(self.replicas, len(self.agents))
+        return torch.from_numpy(np.square(errors).mean(0))
+
+    def network_state(self, lane: int) -> dict[str, Tensor]:
+        """Return copies of the table of a lane, as the state dict of its `TableNetwork`."""
+        states, values, _ = self.tables.lane_table(lane)
+        return {"states": torch.from_numpy(states), "values": torch.from_numpy(values)}
 
     def finite(self) -> Tensor:
-        """Return for each agent whether all values of its table are finite, bool [R, S]."""
-        are_finite = np.ones(len(self.lanes), np.bool_)
+        """Return for each lane whether all values of its table are finite, bool [L]."""
+        lanes = len(self.tables.rows)
+        are_finite = np.ones(lanes, np.bool_)
         if not np.isfinite(self.tables.values[: self.tables.size].sum()):
-            for lane in range(len(self.lanes)):
+            for lane in range(lanes):
                 are_finite[lane] = np.isfinite(self.tables.lane_table(lane)[1]).all()
-        return torch.from_numpy(are_finite).view(self.replicas, len(self.agents))
+        return torch.from_numpy(are_finite)
 
-    def values(self, batch: TensorDictBase | Turn) -> Tensor:
-        """Return the highest action value of each agent after a turn, [B, S]."""
-        next_observation = Turn.of(batch).batch["next", *keys.OBSERVATION]
-        by_column = next_observation[:, list(self.agents)].flatten(0, 1).numpy(force=True)
-        rows = self.tables.find(states_of(by_column), self._lane_by_column)
-        return torch.from_numpy(self.tables.values[rows].max(1)).view(-1, len(self.agents))
+    def state_dict(self) -> dict[str, Tensor]:
+        return self.tables.state_dict()
 
-    def networks(self) -> dict[str, nn.Module]:
-        """Return copies of the agents' tables as networks, by name: "replica_0/agent_0" and so on."""
-        networks: dict[str, nn.Module] = {}
-        for name, table in self._network_states().items():
-            networks[name] = table_network(self.spaces)
-            networks[name].load_state_dict(table)
-        return networks
-
-    def _network_states(self) -> dict[str, dict[str, Tensor]]:
-        """Return the state dicts of the agents' `TableNetwork`s, by name."""
-        network_states = {}
-        for lane, name in enumerate(self.lanes.names):
-            states, values, _ = self.tables.lane_table(lane)
-            network_states[name] = {"states": torch.from_numpy(states), "values": torch.from_numpy(values)}
-        return network_states
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return the full state of all lanes.
-
-        "networks" repeats "tables" in the form in which `cprl.load` reads them.
-        """
-        turns = []
-        for turn in self._turns:
-            turns.append({name: torch.from_numpy(array) for name, array in turn.items()})
-        return {
-            "tables": self.tables.state_dict(),
-            "networks": self._network_states(),
-            "exploration": self.actor.rng.state_dict(),
-            "steps": self.steps,
-            "turns": turns,
-            "rewards": self.rewards.state_dict(),
-        }
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        self.tables.load_state_dict(state["tables"])
-        self.actor.rng.load_state_dict(state["exploration"])
-        self.steps = int(state["steps"])
-        self.actor.epsilon = self.settings.epsilon(self.steps)
-        self._turns.clear()
-        for turn in state["turns"]:
-            self._turns.append({name: field.numpy().copy() for name, field in turn.items()})
-
-        self.rewards.load_state_dict(state["rewards"])
+    def load_state_dict(self, state: Mapping[str, Tensor]) -> None:
+        self.tables.load_state_dict(state)
 
 
 def table_network(spaces: Spaces) -> TableNetwork:

@@ -2,15 +2,16 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
-import numpy as np
 import torch
 from tensordict import TensorDict
 from torch import Tensor
 
-from cprl import keys
 from cprl.keys import Turn
+
+Sizes: TypeAlias = dict[str, tuple[tuple[int, ...], torch.dtype]]
+"""The shape and the dtype of fields, by name."""
 
 
 class Horizon(NamedTuple):
@@ -46,9 +47,20 @@ class TransitionForm:
     """True if the memory stores which agents are in play."""
 
     @property
-    def dtype(self) -> torch.dtype:
-        """Return the dtype of observations."""
-        return getattr(torch, self.observation_dtype)
+    def fields(self) -> Sizes:
+        """Return the shape and the dtype of each field of one lane's `LaneTurn`, without recurrent states."""
+        observation = self.observation_shape, getattr(torch, self.observation_dtype)
+        fields: Sizes = {
+            "observation": observation,
+            "action": (self.action_shape, torch.int64),
+            "next_observation": observation,
+            "reward": (self.reward_shape, torch.float32),
+            "done": ((), torch.bool),
+            "terminated": ((), torch.bool),
+        }
+        if self.has_in_play:
+            fields["in_play"] = self.action_shape, torch.bool
+        return fields
 
     @property
     def steps_ahead(self) -> int:
@@ -81,43 +93,6 @@ class LaneTurn(NamedTuple):
     """float32 [C, K], the states after the turn; None for lanes without a recurrent network."""
     in_play: Any = None
     """bool [C], or [C, S] for teams: whether agents are in play; None for lanes that learn from all turns."""
-
-
-def lane_turn(agents: Sequence[int], turn: Turn, rewards: Any, *, are_team: bool = False) -> LaneTurn:
-    """Return one transition of each of S agents in every world, column = world x S + position in `agents`.
-
-    Fields are views of the turn's entries where that is possible.
-
-    Args:
-        agents: the indices of the S agents.
-        rewards: the shaped rewards of all agents, [B, N].
-        are_team: true if the agents of a world are one column, a team.
-    """
-    worlds, game_agents = rewards.shape
-    indices = list(agents)
-    all_learn = indices == list(range(game_agents))
-    columns = (worlds, len(indices)) if are_team else (worlds * len(indices),)
-
-    def by_agent(entry: Any) -> Any:
-        """Return an entry of all agents, [B, N, ...], as one of the columns, [C, ...]."""
-        selected = entry if all_learn else entry[:, indices]
-        return selected.reshape(*columns, *entry.shape[2:])
-
-    def by_world(flags: Any) -> Any:
-        """Return flags of worlds, [B, 1], as flags of the columns, [C]."""
-        if are_team:
-            return flags.reshape(worlds)
-        count = len(indices)
-        return flags.repeat(count) if isinstance(flags, np.ndarray) else flags.repeat_interleave(count)
-
-    return LaneTurn(
-        by_agent(turn.agents["observation"]),
-        by_agent(turn.agents["action"]),
-        by_agent(turn.next_agents["observation"]),
-        by_agent(rewards),
-        by_world(turn.next_world[keys.DONE]),
-        by_world(turn.next_world[keys.TERMINATED]),
-    )
 
 
 def joint_actions_by_agent(agents: Sequence[int], turn: Turn) -> Any:

@@ -18,8 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME
-from cprl.measuring.table import where, world_of
+from cprl.measuring.table import gain_metric, where, world_of
 from cprl.measuring.windows import episodes_per_world, mean_of_worlds
 from cprl.system.defaults import LAST_EPISODES
 from cprl.values.array_types import Float64
@@ -310,7 +309,6 @@ def outcome_of(table: pa.Table, *, random: float) -> Outcome:
         random: the mean of what agents who act at random get.
     """
     rows = where(table, agent=0)
-    number = COLLECTIVE_RETURN if COLLECTIVE_RETURN in table.column_names else INCOME
     replicas = [where(rows, replica=replica) for replica in rows["replica"].unique().to_pylist()]
     worlds = list(map(world_of, replicas))
     lanes = len(np.unique(worlds[0]))
@@ -321,21 +319,21 @@ def outcome_of(table: pa.Table, *, random: float) -> Outcome:
             for rows, world in zip(replicas, worlds, strict=True)
         ]
 
-    tens = means(number, PEAK_EPISODES)
-    thirties = means(number, LAST_EPISODES)
-    length = min(map(len, tens))
-    short = np.mean([curve[:length] for curve in tens], 0)
-    long = np.mean([curve[:length] for curve in thirties], 0)
+    peak_curves = means(gain_metric(table), PEAK_EPISODES)
+    end_curves = means(gain_metric(table), LAST_EPISODES)
+    length = min(map(len, peak_curves))
+    peak_curve = np.mean([curve[:length] for curve in peak_curves], 0)
+    end_curve = np.mean([curve[:length] for curve in end_curves], 0)
     size = episodes_per_world(PEAK_EPISODES, lanes) * lanes
     later = episodes_per_world(LAST_EPISODES, lanes) * lanes - size
-    peak_index = int(np.nanargmax(short))
+    peak_index = int(np.nanargmax(peak_curve))
     lives = fmean(curve[-1] for curve in means("steps", LAST_EPISODES))
     return Outcome(
-        begins=float(short[~np.isnan(short)][0]),
-        peak=float(short[peak_index]),
+        begins=float(peak_curve[~np.isnan(peak_curve)][0]),
+        peak=float(peak_curve[peak_index]),
         around=min(peak_index + 1 - min(size, length) + size // 2, length),
-        low=float(np.nanmin(long[min(peak_index + later, length - 1) :])),
-        last=fmean(curve[-1] for curve in thirties),
+        low=float(np.nanmin(end_curve[min(peak_index + later, length - 1) :])),
+        last=fmean(curve[-1] for curve in end_curves),
         lived=lives / pc.max(rows["steps"]).as_py(),
         random=random,
         agents=pc.max(table["agent"]).as_py() + 1,

@@ -160,6 +160,12 @@ def all_metrics(table: pa.Table) -> list[str]:
     return [*social, *custom, *institutional, *decisions]
 
 
+def gain_metric(table: pa.Table) -> str:
+    """Return the metric of what all agents get: the collective return, or the income in a game without a
+    harvest."""
+    return COLLECTIVE_RETURN if COLLECTIVE_RETURN in table.column_names else INCOME
+
+
 def episodes(table: pa.Table, metric: str) -> pa.Table:
     """Return one row for each episode: its labels, replica, world and episode, and the "value" of the metric,
     null where it is undefined.

@@ -28,19 +28,16 @@ class Conv(Value):
     hidden_cells: Layers = (32,)
     """Units of each fully connected layer after the convolutions."""
 
-    def make(
-        self, spaces: Spaces, outputs: int, *, shape: Sequence[int] | None = None, **options: Unpack[Options]
-    ) -> "ConvNetwork":
+    def make(self, spaces: Spaces, outputs: int, **options: Unpack[Options]) -> "ConvNetwork":
         """Return a new network.
 
         Args:
             outputs: the number of outputs.
-            shape: the shape of one input; None for that of observations.
 
         Raises:
             ValueError: if inputs have no rows and columns.
         """
-        shape = shape or spaces.observation_shape
+        shape = spaces.observation_shape
         if len(shape) < 3:
             raise ValueError(
                 f"observations have the shape {list(shape)}; allowed for Conv: channels, rows and columns; "

@@ -47,18 +47,19 @@ class MLP(Value):
     hidden_cells: Layers = (32, 32)
     """Units of each hidden layer."""
 
-    def make(
-        self, spaces: Spaces, outputs: int, *, shape: Sequence[int] | None = None, **options: Unpack[Options]
-    ) -> "MLPNetwork":
+    def make(self, spaces: Spaces, outputs: int, **options: Unpack[Options]) -> "MLPNetwork":
         """Return a new network.
 
         Args:
             outputs: the number of outputs.
-            shape: the shape of one input; None for that of observations.
         """
-        shape = shape or spaces.observation_shape
-        highest = spaces.observation_scale
-        return MLPNetwork(shape, outputs, hidden_cells=self.hidden_cells, highest=highest, **options)
+        return MLPNetwork(
+            spaces.observation_shape,
+            outputs,
+            hidden_cells=self.hidden_cells,
+            highest=spaces.observation_scale,
+            **options,
+        )
 
 
 class MLPNetwork(nn.Module):

@@ -42,14 +42,11 @@ class Recurrent(Value, stored=False):
     """Units H of the recurrent layer."""
     kind: ClassVar[_Kind]
 
-    def make(
-        self, spaces: Spaces, outputs: int, *, shape: Sequence[int] | None = None, **options: Unpack[Options]
-    ) -> "RecurrentNetwork":
+    def make(self, spaces: Spaces, outputs: int, **options: Unpack[Options]) -> "RecurrentNetwork":
         """Return a new network.
 
         Args:
             outputs: the number of outputs.
-            shape: the shape of one input; None for that of observations.
 
         Raises:
             ValueError: if an option is set: recurrent networks have none.
@@ -60,7 +57,7 @@ class Recurrent(Value, stored=False):
         *hidden_cells, features = self.encoder.hidden_cells
         # The encoder's last hidden layer becomes its output layer, with ReLU.
         without_last = replace(self.encoder, hidden_cells=tuple(hidden_cells))
-        encoder = without_last.make(spaces, features, relu_on_outputs=True, shape=shape)
+        encoder = without_last.make(spaces, features, relu_on_outputs=True)
         return RecurrentNetwork(encoder, outputs, kind=self.kind, recurrent_cells=self.recurrent_cells)
 
 

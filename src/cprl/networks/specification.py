@@ -41,8 +41,10 @@ def new_network(
     Raises:
         ValueError: if a network of your own cannot be made or called, or has other outputs.
     """
+    if shape is not None:
+        spaces = replace(spaces, observation_shape=tuple(shape))
     if not isinstance(network, Custom):
-        return network.make(spaces, outputs, shape=shape, **options)
+        return network.make(spaces, outputs, **options)
     for name, value in options.items():
         if value:
             raise ValueError(
@@ -51,7 +53,6 @@ def new_network(
             )
     name = f"the network {network.target}"
     if shape is not None:
-        spaces = replace(spaces, observation_shape=tuple(shape))
         name += " of a critic, whose observation has the members first,"
     return _custom_network(network, name, spaces, outputs)
 

@@ -27,7 +27,7 @@ _NO_UPDATER: Final = (
 )
 
 
-_STATE_TYPES: Final = bool | int | float | Tensor
+STATE_TYPES: Final = bool | int | float | Tensor
 """The types of attributes of a loss that count as its state."""
 
 
@@ -53,20 +53,18 @@ class FunctionalLoss:
         refuse_updaters(loss, _NO_UPDATER.format(type(loss).__name__))
         self.module = loss
 
-    def __call__(self, params: Weights, targets: Weights, batch: TensorDict) -> Tensor:
+    def __call__(self, weights: Weights, batch: TensorDict) -> Tensor:
         """Return the loss of each transition, [L, b], or [b] under vmap; one number if the loss averages it.
 
         Args:
-            params: the weights that are trained, named as by `named_weights`.
-            targets: the other weights.
+            weights: all weights of the loss, named as by `named_weights`.
         """
-        weights = {**params, **targets}
         for name, size in self._groups.items():
             prefix = f"{name}:"
             group = {key.removeprefix(prefix): weights[key] for key in weights if key.startswith(prefix)}
             setattr(self.module, name, TensorDict(group, size).unflatten_keys("."))
         for name in self._single_names:
-            setattr(self.module, name, params[name])
+            setattr(self.module, name, weights[name])
         if not torch.compiler.is_compiling():
             forget_cached_weights(self.module)
         losses = total(self.module(batch), self.module)
@@ -96,7 +94,7 @@ def make_lazy_parts(loss: LossModule) -> None:
 
 def attributes_of(loss: LossModule) -> dict[str, Any]:
     """Return the attributes of a loss that are numbers or tensors, which it may change from call to call."""
-    return {name: value for name, value in vars(loss).items() if isinstance(value, _STATE_TYPES)}
+    return {name: value for name, value in vars(loss).items() if isinstance(value, STATE_TYPES)}
 
 
 def set_attributes(loss: LossModule, attributes: Mapping[str, Any]) -> None:

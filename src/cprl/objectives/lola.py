@@ -130,8 +130,6 @@ def _gradient_function(objective: Objective) -> Callable[[_Nested], tuple[_Neste
 def _mean_gradient(tables: Sequence[list[_Nested]], agent: int, peer: int) -> list[Tensor]:
     """Return the gradient of an agent's loss by the parameters of an agent, the mean over several tables of
     `_gradient_function`."""
-    if len(tables) == 1:
-        return list(tables[0][agent][peer])
     by_parameter = zip(*(table[agent][peer] for table in tables), strict=True)
     return [torch.stack(estimates).mean(0) for estimates in by_parameter]
 

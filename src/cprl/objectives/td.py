@@ -3,7 +3,7 @@ the base of cprl's own losses with one-step targets."""
 
 from dataclasses import dataclass
 from math import log
-from typing import Any, ClassVar, Final, Self
+from typing import Any, ClassVar, Literal, Self, TypeAlias
 
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
@@ -15,11 +15,9 @@ from torchrl.objectives.utils import dispatch_value_estimator, distance_loss
 
 from cprl.system.compat.torchrl import ReshapedLoss
 
-LOG_COSH: Final = "log_cosh"
-"""The name of the log-cosh loss among loss functions."""
-TORCHRL_DISTANCES: Final = ("l1", "l2", "smooth_l1")
+TorchRLDistance: TypeAlias = Literal["l1", "l2", "smooth_l1"]
 """The loss functions that TorchRL has."""
-DISTANCES: Final = (*TORCHRL_DISTANCES, LOG_COSH)
+Distance: TypeAlias = Literal["l1", "l2", "smooth_l1", "log_cosh"]
 """The loss functions of `td_distance`."""
 
 
@@ -39,9 +37,9 @@ def td_distance(value: Tensor, target: Tensor, name: str) -> Tensor:
     """Return the loss of each value, in the shape of `value`, by a loss function.
 
     Args:
-        name: a name in `DISTANCES`.
+        name: a `Distance`.
     """
-    if name == LOG_COSH:
+    if name == "log_cosh":
         return log_cosh(value - target)
     return distance_loss(value, target, name)
 

@@ -5,7 +5,6 @@ Modules in reading order:
     colours          the palette of all pictures for people
     image            draws a board as pixels; agents have a number, a heading and a mark
     episode_picture  draws an episode turn by turn: board, apples and harvests in one picture
-    svg              draws the board of a map as SVG
     readable         says a game's rules and institutions in words
     decoding         turns observations back into classes of cells, for viewers and for scripted policies
 """

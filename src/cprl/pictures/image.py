@@ -4,13 +4,16 @@ The digits of the numbers are paths on a grid of three by five points. So an ima
 the viewer can draw them as lines, both without a font.
 """
 
+from base64 import b64encode
 from collections.abc import Sequence
 from functools import cache
+from io import BytesIO
 from itertools import pairwise
 from typing import Annotated, Any, Final, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from cprl.commons.cells import APPLE, BEAM, CLEANING, GROUND, WALL, WASTE, WATER, Colour
 from cprl.commons.maps import Cell, Map
@@ -56,6 +59,32 @@ def world_image(board: Map, world: WorldView, *, cell_pixels: int = 24) -> UInt8
         inside[sprite == INK] = INK_COLOUR
         inside[sprite == MARKED] = MARK_COLOUR
     return image
+
+
+_START_CELL_PIXELS: Final = 20
+"""The width and height of a cell in a picture of a map."""
+
+
+def board_html(board: Map) -> str:
+    """Return a picture of a board as an episode begins on it, with an apple on every site, as HTML."""
+    cells = np.zeros((board.height, board.width), np.uint8)
+    for index in board.waste:
+        cells[board.river[index]] = WASTE
+    row, col, heading = np.array(board.starts, np.int32).reshape(-1, 3).T
+    start = WorldView(
+        observation=np.empty(0, np.uint8),
+        board=cells,
+        stock=np.ones(len(board.sites), np.uint8),
+        row=row,
+        col=col,
+        heading=heading,
+        in_play=np.ones(len(row), np.bool_),
+        harvested=np.zeros(len(row), np.int32),
+    )
+    png = BytesIO()
+    Image.fromarray(world_image(board, start, cell_pixels=_START_CELL_PIXELS)).save(png, "PNG")
+    source = f"data:image/png;base64,{b64encode(png.getvalue()).decode('ascii')}"
+    return f'<img src="{source}" alt="{board!r}" style="max-width:100%">'
 
 
 def _inside(image: UInt8, cell: Cell, size: int, *, inset: int = 0) -> UInt8:

@@ -32,7 +32,7 @@ from cprl.institutions import (
 )
 from cprl.institutions.institution import Kind
 from cprl.institutions.monitoring import ELECTED
-from cprl.pictures.svg import board_svg
+from cprl.pictures.image import board_html
 from cprl.values import is_number
 
 
@@ -42,7 +42,7 @@ def game_html(game: Game, custom_rules: str = "") -> str:
     `custom_rules`: further rules in words, e.g. those of the user's own transforms.
     """
     rules = "; ".join(filter(None, (rules_of(game), custom_rules))) or NO_RULES
-    return f"<p>{escape(growth_of(game))} Rules: {escape(rules)}.</p>{board_svg(game.map)}"
+    return f"<p>{escape(growth_of(game))} Rules: {escape(rules)}.</p>{board_html(game.map)}"
 
 
 NO_RULES: Final = "none beyond the game"

@@ -12,8 +12,8 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl import recurrent_state
 from cprl.commons.spaces import Spaces
+from cprl.keys import recurrent_state
 from cprl.policies.rng import LaneRng, Purpose, lane_seeds
 from cprl.system.compiling import Compiled
 

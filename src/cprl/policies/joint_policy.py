@@ -9,7 +9,8 @@ from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 
-from cprl import keys, recurrent_state
+from cprl import keys
+from cprl.keys import recurrent_state
 from cprl.policies.actors import LaneActor
 from cprl.policies.decisions import Decider
 from cprl.policies.governors import GovernorActor

@@ -17,10 +17,11 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 
-from cprl import keys, recurrent_state
+from cprl import keys
 from cprl.commons.cells import class_name
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
+from cprl.keys import recurrent_state
 from cprl.pictures.decoding import SIGNS, window_text
 from cprl.pictures.readable import instructions_of
 from cprl.policies.actors import LaneActor

@@ -5,7 +5,8 @@ Modules, in the order in which one reads them:
     length       how long a training is: episodes or steps
     schedule     how long it is, in how many worlds, and when its agents learn
     recipe       the run's directory and recipe.json
-    episodes     the table of episodes and its journal, whose rows are safe as soon as they are written
+    journal      rows that are safe as soon as they are written
+    episodes     the table of episodes, and its journal
     curves       tables as curves over episodes
     checkpoints  the state of a training, to resume from, or to extend
     weights      trained networks, the state of transforms, the values of decisions

@@ -78,7 +78,11 @@ class Checkpointer:
         self._last_finite: Path | None = None
 
     def restore(self, training: Any) -> None:
-        """Restore the newest readable checkpoint, if there is one."""
+        """Restore the newest readable checkpoint, if there is one.
+
+        Raises:
+            ValueError: if there are checkpoints, and none can be read; says why not.
+        """
         reasons: list[str] = []
         cause: Exception | None = None
         for path in reversed(checkpoints_in(self.folder)):
@@ -241,7 +245,11 @@ def endings_of(run: Path) -> list[Path]:
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:
-    """Read the state in a checkpoint, without running code of the file."""
+    """Read the state in a checkpoint, without running code of the file.
+
+    Raises:
+        ValueError: for any other file, a damaged one, and one that a newer cprl wrote.
+    """
     if not _FILE_NAME.fullmatch(path.name):
         raise ValueError(f"{path} is not a checkpoint; allowed: a name like training-<steps>-<checksum>.pt")
     state = read_tensors(path, "is not the state of a training")
@@ -254,6 +262,9 @@ def read_tensors(path: Path, refusal: str) -> dict[str, Any]:
 
     Args:
         refusal: the message about a file with other content.
+
+    Raises:
+        ValueError: for a damaged file, and for one with other content.
     """
     try:
         verify(path)

@@ -1,7 +1,6 @@
 """The episodes of a run as a table: one row for each replica, episode and agent.
 
-During a run every episode is appended at once to a journal, `episodes.arrows`: an Arrow stream, which unlike
-a parquet file needs no footer and so stays readable if the process is killed. `EpisodeTable.close` converts
+During a run every episode is appended at once to a journal, `episodes.arrows`. `EpisodeTable.close` converts
 it to `episodes.parquet`; `read_episodes` reads either.
 """
 
@@ -10,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from errno import EIO, ENOENT
 from functools import partial
-from io import BytesIO, FileIO
+from io import BytesIO
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Self
 
@@ -25,61 +24,19 @@ from cprl.measuring.table import stored_metrics, world_of
 from cprl.runs.files import (
     RECIPE_FILE,
     RECIPE_FORMAT,
-    break_hard_links,
     read_json,
     refuse_newer,
-    refuse_no_file,
     refuse_to_write_over,
-    sync_folder,
     verify,
     write_atomically,
     write_listed,
 )
+from cprl.runs.journal import Journal, read_journal
 
 FILE_NAME: Final = "episodes.parquet"
 
 _ROWS_PER_GROUP: Final = 2**16
 """Rows of a group of a parquet file; files with small groups are slow to read."""
-
-
-def batches_in(path: Path) -> Iterator[tuple[pa.RecordBatch, int]]:
-    """Yield the whole batches of a journal, each with the byte at which it ends."""
-    refuse_no_file(path)
-    source = pa.BufferReader(path.read_bytes())
-    try:
-        for batch in pa.ipc.open_stream(source):
-            batch.validate()
-            yield batch, source.tell()
-    except (pa.ArrowException, OSError):  # the journal ends within a batch, or within the schema
-        return
-
-
-def read_journal(path: Path) -> pa.Table:
-    """Return the rows of a journal; an empty table with all columns if it holds no whole batch."""
-    batches = [batch for batch, _ in batches_in(path)]
-    if batches:
-        return pa.Table.from_batches(batches)
-    return _schema([*COLUMNS, *(name for name in SOCIAL_METRICS if METRICS[name].is_stored)]).empty_table()
-
-
-def _batch_bytes(batch: pa.RecordBatch, *, is_first: bool) -> bytes:
-    """Return the bytes of a batch in a stream; the first batch follows the schema."""
-    header = batch.schema.serialize().to_pybytes() if is_first else b""
-    message: bytes = header + batch.serialize().to_pybytes()
-    return message
-
-
-def append_batch(file: FileIO, batch: pa.RecordBatch, *, is_first: bool) -> None:
-    """Append a batch to a journal, whole or not at all: after half a batch nothing could be read."""
-    end = file.tell()
-    left = memoryview(_batch_bytes(batch, is_first=is_first))
-    try:
-        while left:
-            left = left[file.write(left) :]
-    except BaseException:
-        file.seek(end)
-        file.truncate()
-        raise
 
 
 class EpisodeTable:
@@ -103,9 +60,7 @@ class EpisodeTable:
         self.journal = self.path.with_suffix(".arrows")
         self._resumable = resumable
         self._is_closed = False
-        self._file: FileIO | None = None
-        self._rows = 0
-        self._schema = None
+        self._open_journal: Journal | None = None
         for table in () if resumable else (self.path, self.journal):
             if table.exists():
                 raise FileExistsError(f"{table} exists and is not overwritten; use another directory")
@@ -114,56 +69,40 @@ class EpisodeTable:
         elif not self.journal.exists():
             self._open()
 
-    def _open(self, rows: int = 0) -> FileIO:
+    def _open(self, rows: int = 0) -> Journal:
         """Open the journal after its first `rows` rows, and drop the others."""
-        count = 0
-        bytes_kept = 0
-        schema = None
-        for batch, end in batches_in(self.journal) if rows else ():
-            count += batch.num_rows
-            bytes_kept = end
-            schema = batch.schema
-            if count >= rows:
-                break
-        if count != rows:
-            raise ValueError(f"{self.journal} holds {count} rows up to there; the checkpoint has {rows}")
-        is_new = not self.journal.exists()
-        mode = "x" if is_new else "r+"
-        if self._file is not None:
-            self._file.close()
-        break_hard_links(self.journal)
-        self._file = FileIO(self.journal, mode)  # unbuffered, so that it survives a kill
-        self._file.truncate(bytes_kept)
-        self._file.seek(bytes_kept)
-        self._rows = count
-        self._schema = schema
-        if is_new:
-            sync_folder(self.journal.parent)
-        return self._file
+        if self._open_journal is not None:
+            self._open_journal.close()
+        self._open_journal = Journal(self.journal, rows=rows)
+        return self._open_journal
 
     def state_dict(self) -> dict[str, int]:
         """Sync the rows to the disk and return their number."""
-        if self._file is not None:
-            os.fsync(self._file.fileno())
-        return {"rows": self._rows}
+        if self._open_journal is None:
+            return {"rows": 0}
+        self._open_journal.sync()
+        return {"rows": self._open_journal.rows}
 
     def load_state_dict(self, state: Mapping[str, int]) -> None:
         """Continue after the given number of rows, and drop later ones."""
         self._open(int(state["rows"]))
 
     def add(self, *episodes: Episode) -> None:
-        """Append episodes; the first one of a table determines the columns and metrics of all."""
+        """Append episodes; the first one of a table determines the columns and metrics of all.
+
+        Raises:
+            OSError: if they cannot be written; the earlier ones are intact.
+            ValueError: for an episode with other columns.
+        """
         if not episodes:
             return
-        file = self._file or self._open()  # start over if there was no checkpoint
-        batch = rows_of(episodes, self._schema or schema_of(episodes[0]))
+        journal = self._open_journal or self._open()  # start over if there was no checkpoint
+        batch = rows_of(episodes, journal.schema or schema_of(episodes[0]))
         try:
-            append_batch(file, batch, is_first=self._schema is None)
+            journal.add(batch)
         except OSError as error:
-            what = f"could not add episodes; the {self._rows} earlier rows are in {self.journal}"
+            what = f"could not add episodes; the {journal.rows} earlier rows are in {self.journal}"
             raise OSError(error.errno, f"{error.strerror or error}: {what}") from error
-        self._schema = batch.schema
-        self._rows += batch.num_rows
 
     def on_episode(self, episode: Episode, learning: Mapping[str, float]) -> None:
         self.add(episode)
@@ -176,9 +115,10 @@ class EpisodeTable:
         """
         if self._is_closed:
             return
-        (self._file or self._open()).close()
+        journal = self._open_journal or self._open()
+        journal.close()
         try:
-            write_listed(self.path.parent, self.path.name, self._write_parquet)
+            write_listed(self.path.parent, self.path.name, partial(_write_parquet, journal))
         except FileNotFoundError as error:
             raise FileNotFoundError(ENOENT, f"{error.strerror}: was {self.journal} deleted?") from error
         except OSError as error:
@@ -187,22 +127,30 @@ class EpisodeTable:
         self.journal.unlink()
         self._is_closed = True
 
-    def _write_parquet(self, target: BinaryIO) -> None:
-        table = read_journal(self.journal)
-        if table.num_rows != self._rows:
-            raise OSError(
-                EIO, f"{self.journal} holds {table.num_rows} rows of the {self._rows} that were added"
-            )
-        pq.write_table(table, target, row_group_size=_ROWS_PER_GROUP)
-
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
         if not self._resumable or error is None:
             self.close()
-        elif self._file is not None:
-            self._file.close()
+        elif self._open_journal is not None:
+            self._open_journal.close()
+
+
+def _write_parquet(journal: Journal, target: BinaryIO) -> None:
+    """Write the rows of a closed journal as a parquet file."""
+    table = _read_journal(journal.path)
+    if table.num_rows != journal.rows:
+        raise OSError(
+            EIO, f"{journal.path} holds {table.num_rows} rows of the {journal.rows} that were added"
+        )
+    pq.write_table(table, target, row_group_size=_ROWS_PER_GROUP)
+
+
+def _read_journal(path: Path) -> pa.Table:
+    """Return the rows of a journal of episodes; an empty table with all columns if it has no whole batch."""
+    metrics = (name for name in SOCIAL_METRICS if METRICS[name].is_stored)
+    return read_journal(path, _schema([*COLUMNS, *metrics]))
 
 
 def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
@@ -217,7 +165,7 @@ def read_episodes(run_directory: str | os.PathLike[str]) -> pa.Table:
         refuse_newer(recipe, read_json(recipe), RECIPE_FORMAT)
     try:
         # The journal comes first: while it exists it holds every row, also during a merge.
-        table = read_journal(path.with_suffix(".arrows"))
+        table = _read_journal(path.with_suffix(".arrows"))
     except FileNotFoundError:
         if not path.exists():
             raise FileNotFoundError(f"{path} and its journal do not exist: is this a run?") from None
@@ -314,9 +262,13 @@ def read_evaluations(run: Path) -> pa.Table | None:
 def _restore_journal(path: Path, journal: Path) -> None:
     """Write the journal of a finished table again, one batch for each episode."""
     table = read_rows(path).combine_chunks()
-    batches = table.to_batches(max_chunksize=max(table["agent"].to_pylist(), default=0) + 1)
-    messages = [_batch_bytes(batch, is_first=index == 0) for index, batch in enumerate(batches)]
-    write_atomically(journal, lambda file: file.writelines(messages))
+    agents = max(table["agent"].to_pylist(), default=0) + 1
+
+    def write(file: BinaryIO) -> None:
+        with pa.ipc.new_stream(file, table.schema) as stream:
+            stream.write_table(table, max_chunksize=agents)
+
+    write_atomically(journal, write)
 
 
 _INDEX_COLUMNS: Final = ("replica", "episode", "agent")
@@ -358,7 +310,11 @@ def schema_of(episode: Episode) -> pa.Schema:
 
 
 def rows_of(episodes: Sequence[Episode], schema: pa.Schema) -> pa.RecordBatch:
-    """Return a row for each episode and agent, with the schema of the table's first episode."""
+    """Return a row for each episode and agent, with the schema of the table's first episode.
+
+    Raises:
+        ValueError: for an episode with other columns.
+    """
     columns_of_episodes = list(map(_columns, episodes))
     for columns in columns_of_episodes:
         if columns.keys() != set(schema.names):

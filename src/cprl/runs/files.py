@@ -38,7 +38,7 @@ RECIPE_FORMAT: Final = 2
 """The format of `recipe.json`, and of the journal and `report.json` beside it."""
 MANIFEST_FORMAT: Final = 1
 """The format of `manifest.json`, and of what it lists: weights, tables, transforms, decisions."""
-TRAINING_STATE_FORMAT: Final = 8
+TRAINING_STATE_FORMAT: Final = 9
 """The format of checkpoints."""
 STUDY_FORMAT: Final = 1
 """The format of `study.json`."""
@@ -65,6 +65,9 @@ def write_atomically(
 
     Args:
         name: returns the final name for the complete temporary file, if it depends on the content.
+
+    Raises:
+        OSError: if it cannot be written; an existing file is intact.
     """
     partial = path.with_name(f"{path.name}.{secrets.token_hex(4)}.partial")
     try:

@@ -23,6 +23,10 @@ def check_logger(logger: object) -> None:
 
     Args:
         logger: a name in `LOGGER_PACKAGES`; other objects are not checked.
+
+    Raises:
+        ValueError: for another name.
+        ModuleNotFoundError: if its package is not installed.
     """
     if not isinstance(logger, str):
         return

@@ -160,6 +160,9 @@ def read_recipe(run: Path) -> dict[str, Any]:
 
     Args:
         run: its directory, or the file itself.
+
+    Raises:
+        ValueError: if there is none, or if it is no recipe that this cprl can read.
     """
     path = Path(run) if Path(run).is_file() else Path(run) / RECIPE_FILE
     try:
@@ -202,6 +205,9 @@ def recipe_config(recipe: Mapping[str, Any], *, where: object = "the recipe") ->
 
     Args:
         where: the name of the recipe in messages.
+
+    Raises:
+        ValueError: for a table of another format, or without an experiment.
     """
     refuse_newer(where, recipe, RECIPE_FORMAT)
     if recipe.get("format") != RECIPE_FORMAT or not isinstance(recipe.get("experiment"), Mapping):
@@ -233,7 +239,11 @@ def with_runs_moved(table: Any, start: str | Path, end: str | Path, *, is_run: b
 
 
 def runs_in(paths: Iterable[Path | str]) -> list[Path]:
-    """Return the runs among paths, in order: each is a run's directory, or one that holds runs."""
+    """Return the runs among paths, in order: each is a run's directory, or one that holds runs.
+
+    Raises:
+        ValueError: for a path without runs, a run that is there twice, and without any path.
+    """
     runs: list[Path] = []
     for folder in map(Path, paths):
         is_run = (folder / RECIPE_FILE).exists()

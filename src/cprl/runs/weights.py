@@ -22,7 +22,11 @@ DECISIONS: Final = "decisions.pt"
 
 def save_weights(run: Path, networks: Mapping[str, nn.Module], *, name: str = "final") -> Path:
     """Write the weights of each agent's network, by the agent's name, atomically into
-    `checkpoints/<name>.pt` of a run, which `load_weights` reads."""
+    `checkpoints/<name>.pt` of a run, which `load_weights` reads.
+
+    Raises:
+        ValueError: for a name that is none of a file.
+    """
     if not name or Path(name).name != name or "\0" in name:
         raise refusal("name", name, "the name of a file, without slashes and suffix")
     weights = {agent: network.state_dict() for agent, network in networks.items()}

@@ -140,14 +140,18 @@ class Overview:
             note = reason or self._status[trial.name].failure()
             note = note or (REASONS["refused"] if state == "refused" else "")
             idle: TrialState = "waiting" if state == "missing" else "unfinished"
-            return TrialProgress(trial, "failed" if note else idle, episodes, of, note=note)
+            if note:
+                idle = "failed"
+            return TrialProgress(trial, idle, episodes, of, note=note)
         per_s = status.get("episodes_per_s") or 0.0
         left = f"{format_duration((of - episodes) / per_s)} left" if per_s else ""
         running = TrialProgress(trial, "running", episodes, of, per_s, left)
         if status.get("is_compiling"):
             note = f"for {format_duration(status.get('compiling_s', 0.0))}"
             return running._replace(state="compiling", note=note)
-        return running._replace(state="evaluating", note="") if episodes == of else running
+        if episodes == of:
+            return running._replace(state="evaluating", note="")
+        return running
 
     def _read_status(self, name: str) -> Mapping[str, Any]:
         """Read the status of a trial, and note the time if it has changed.

@@ -66,14 +66,14 @@ def course_of(run: Path, agents: Sequence[AgentSpec]) -> str:
         lines = [
             f"The agents began at {outcome.begins:.0f} apples an episode, all together, and reached "
             f"{outcome.peak:.0f} around episode {outcome.around}.",
-            f"While they learn, in {last_text(table)}, they get {_got(levels, _LEARNING)}.",
+            f"While they learn, in {last_text(table)}, they get {_harvest_and_life(levels, _LEARNING)}.",
         ]
         conditions = f", where {_fresh_conditions(agents, table)},"
         is_tragedy = outcome.word == TRAGEDY
     lines += [
-        f"In fresh worlds{conditions} they get {_got(levels, _FRESH)}.",
+        f"In fresh worlds{conditions} they get {_harvest_and_life(levels, _FRESH)}.",
         *_replica_sentences(fresh),
-        f"Random play gets {_got(levels, _RANDOM)}.",
+        f"Random play gets {_harvest_and_life(levels, _RANDOM)}.",
         _verdict(gaps, baseline, is_tragedy),
     ]
     return "\n".join(lines)
@@ -89,7 +89,7 @@ def last_text(table: pa.Table) -> str:
     return last if worlds == 1 else f"{last} of each of {worlds} worlds"
 
 
-def _got(levels: Family, phase: str) -> str:
+def _harvest_and_life(levels: Family, phase: str) -> str:
     """Return how many apples agents get and how long boards last, in words."""
     return f"{levels[phase, COLLECTIVE_RETURN]} apples, and boards last {levels[phase, _LIFE]} steps"
 
@@ -118,18 +118,17 @@ def _replica_sentences(fresh: pa.Table) -> list[str]:
     death_shares = deaths.sort_by("replica")["terminated_mean"].to_pylist()
     replicas = len(apples)
     if 1 < replicas <= _FEW_REPLICAS:
-        harvests = f"{_listed(apples, number_format(*apples))} apples"
-        lives = f"{_listed(steps, number_format(*steps))} steps"
-        return [
-            f"By replica that is {harvests} and {lives}; {_listed(death_shares, '.0%')} of the boards die."
-        ]
+        harvests = f"{_enumerated(apples, number_format(*apples))} apples"
+        lives = f"{_enumerated(steps, number_format(*steps))} steps"
+        deaths_text = _enumerated(death_shares, ".0%")
+        return [f"By replica that is {harvests} and {lives}; {deaths_text} of the boards die."]
     dying = sum(share > 0.5 for share in death_shares)
     if not 0 < dying < replicas:
         return []
     return [f"There most boards of {dying} of the {replicas} replicas die, those of the others last."]
 
 
-def _listed(values: Sequence[float], format_spec: str) -> str:
+def _enumerated(values: Sequence[float], format_spec: str) -> str:
     """Return numbers as "1, 2 and 3", each in the same format."""
     *firsts, last = (f"{value:{format_spec}}" for value in values)
     return f"{', '.join(firsts)} and {last}"

@@ -178,9 +178,10 @@ class Sheet:
 
     def _wrap_labels(self) -> None:
         """Wrap the titles and the axis labels of all panels, with the label that they share."""
-        for axes in self._lowest if self.xlabel else ():
-            axes.tick_params(labelbottom=True)
-            axes.set_xlabel(self.xlabel)
+        if self.xlabel:
+            for axes in self._lowest:
+                axes.tick_params(labelbottom=True)
+                axes.set_xlabel(self.xlabel)
         for axes in self.figure.axes:
             row_height_em = self._row_heights_em.get(axes, self._panels_high_em)
             axes.set_title(wrapped(axes.get_title("left"), self._panel_wide_em - 1))

@@ -19,7 +19,7 @@ from cprl.measuring.registry import (
 )
 from cprl.measuring.social import are_equal
 from cprl.measuring.statistics import HOLM_NOTE, Family, differences, estimates, notes_on
-from cprl.measuring.table import all_metrics, display_name, where
+from cprl.measuring.table import all_metrics, display_name, gain_metric, where
 from cprl.runs.episodes import LEFT_OUT
 from cprl.system.output import console as safe_console, quote_command
 from cprl.system.shipped import cprl_command
@@ -71,14 +71,11 @@ def summarise(
 def ordered_metrics(table: pa.Table) -> list[str]:
     """Return the names of all metrics in the order of their rows: of whole episodes, then of each agent.
 
-    The income follows the collective return. A metric of an agent has a name such as "agent_0/return".
+    A metric of an agent has a name such as "agent_0/return".
     """
-    metrics = [metric for metric in all_metrics(table) if metric != INCOME]
-    income_index = 1 if COLLECTIVE_RETURN in metrics else 0
-    metrics.insert(income_index, INCOME)
     amounts = [amount for amount in ("return", *AGENT_TOTALS) if amount in table.column_names]
     agents = range(len(table["agent"].unique()))
-    return [*metrics, *(f"agent_{agent}/{amount}" for amount in amounts for agent in agents)]
+    return [*all_metrics(table), *(f"agent_{agent}/{amount}" for amount in amounts for agent in agents)]
 
 
 def _is_summarised(name: str) -> bool:
@@ -185,8 +182,7 @@ def _is_idle(levels: Family, policy: str) -> bool:
 
 def _verdict(played: pa.Table, baseline: str) -> str:
     """Return in words how much each policy gets, and how much more than the baseline."""
-    has_harvest = COLLECTIVE_RETURN in played.column_names
-    name = COLLECTIVE_RETURN if has_harvest else INCOME
+    name = gain_metric(played)
     levels = estimates(played, name, "policy")
     gaps = differences(played, name, "policy", {"policy": baseline})
     parts = []
@@ -194,7 +190,7 @@ def _verdict(played: pa.Table, baseline: str) -> str:
         gap = gaps.get((policy, name))
         comparison = "" if gap is None else f" ({gap:+} beside {_policy_name(baseline)})"
         parts.append(f"{_policy_name(policy)}: {level}{comparison}")
-    unit = APPLES if has_harvest else "of return"
+    unit = "of return" if name == INCOME else APPLES
     return f"{'; '.join([parts[-1], *parts[:-1]])} {unit} an episode, all agents together"
 
 

@@ -50,7 +50,14 @@ class Change:
     """The text after the number, e.g. "(of 2)"."""
 
     def __str__(self) -> str:
-        return " ".join(filter(None, (f"{self.estimate:+}", self.more)))
+        return self.marked("{}")
+
+    def marked(self, template: str) -> str:
+        """Return the text; if the difference is not 0, its number is put into a template such as "{} *"."""
+        number = f"{self.estimate:+}"
+        if self.estimate.differs:
+            number = template.format(number)
+        return " ".join(filter(None, (number, self.more)))
 
 
 TableCell = Union[str, "Estimate", Change]
@@ -238,25 +245,23 @@ def _is_bold(cell: TableCell) -> bool:
     return isinstance(cell, Change) and cell.estimate.differs
 
 
-def _mark_bold(cell: TableCell, template: str) -> str:
-    """Return the text of a cell; of a bold one the number is put into a template such as "{} *"."""
-    if isinstance(cell, Change) and _is_bold(cell):
-        return str(cell).replace(f"{cell.estimate:+}", template.format(f"{cell.estimate:+}"), 1)
-    return str(cell)
+def _marked(cell: TableCell, template: str) -> str:
+    """Return the text of a cell, with differences that are not 0 in a template, see `Change.marked`."""
+    return cell.marked(template) if isinstance(cell, Change) else str(cell)
 
 
 def _marked_by_star(cell: TableCell) -> str:
-    return _mark_bold(cell, "{} *")
+    return _marked(cell, "{} *")
 
 
 def _in_markdown(cell: TableCell) -> str:
-    return escape_cell(cell) if isinstance(cell, str) else _mark_bold(cell, "**{}**")
+    return escape_cell(cell) if isinstance(cell, str) else _marked(cell, "**{}**")
 
 
 def _in_latex(cell: TableCell) -> str:
     if isinstance(cell, str):
         return " ".join(cell.split()).translate(_LATEX_ESCAPES)
-    return re.sub(r"-(?=[\d.])", "$-$", _mark_bold(cell, r"\textbf{{{}}}"))
+    return re.sub(r"-(?=[\d.])", "$-$", _marked(cell, r"\textbf{{{}}}"))
 
 
 class _NameWrapper(TextWrapper):

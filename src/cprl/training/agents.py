@@ -16,7 +16,7 @@ from cprl.commons.spaces import Spaces
 from cprl.envs.make_env import spaces_of
 from cprl.envs.unwrap import agent_names, commons_game_of
 from cprl.learners.lanes import Lanes
-from cprl.learners.protocol import AnyLearner
+from cprl.learners.learner import Learner
 from cprl.measuring.registry import OPTIONAL_ENTRIES, reported_by
 from cprl.networks.agent import acting_network
 from cprl.networks.recurrent import state_shape_of
@@ -60,7 +60,7 @@ from cprl.training.stored import (
 from cprl.values import instantiate, short_repr
 
 
-def _refuse_only_in_play(learner: AnyLearner, env: EnvBase) -> None:
+def _refuse_only_in_play(learner: Learner, env: EnvBase) -> None:
     """Raise a ValueError for `only_in_play` in a game without the entry "in_play"."""
     has_in_play = keys.IN_PLAY in env.observation_spec.keys(True, True)
     if getattr(learner.settings, "only_in_play", False) and not has_in_play:
@@ -123,7 +123,7 @@ class Population:
         self._replica_numbers = range(first_replica, first_replica + self.replicas)
         self.calls = Calls()
         """The calls of the agents' language models."""
-        self.learners: dict[tuple[int, ...], AnyLearner] = {}
+        self.learners: dict[tuple[int, ...], Learner] = {}
         for spec, agents in groups:
             if isinstance(spec, Learning | Team):
                 self.learners[agents] = self._make_learner(spec, agents, engine, self.spaces, starts=starts)
@@ -330,7 +330,7 @@ class Population:
         spaces: Spaces,
         *,
         starts: bool = False,
-    ) -> AnyLearner:
+    ) -> Learner:
         start_from = self._start_weights(spec, agents) if starts else {}
         lanes = Lanes(
             spaces,

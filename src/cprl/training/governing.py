@@ -11,7 +11,7 @@ from torch import Tensor
 from cprl import keys
 from cprl.commons.game import Game
 from cprl.keys import Turn
-from cprl.learners.protocol import AnyLearner
+from cprl.learners.learner import Learner
 from cprl.measuring.social import incomes_of
 from cprl.measuring.welfare import welfare
 from cprl.policies.governors import GovernorActor
@@ -38,7 +38,7 @@ class Governing:
         learner: learns, as the agent after the last one; None for a governor that does not learn.
     """
 
-    def __init__(self, game: Game, actor: GovernorActor, learner: AnyLearner | None) -> None:
+    def __init__(self, game: Game, actor: GovernorActor, learner: Learner | None) -> None:
         self._game = game
         self.actor = actor
         self.learner = learner
@@ -66,7 +66,7 @@ class Governing:
             self._learn(self.learner)
             self._period = {}
 
-    def _learn(self, learner: AnyLearner) -> None:
+    def _learn(self, learner: Learner) -> None:
         """Learn from the period that has ended."""
         batch = self._transitions()
         learner.store(batch)

@@ -11,11 +11,11 @@ from torchrl.envs import EnvBase
 
 from cprl.commons.game import Game
 from cprl.keys import Turn
-from cprl.learners.protocol import AnyLearner
+from cprl.learners.learner import Learner
 from cprl.policies.decisions import Decider
 from cprl.values.array_types import Float64
 
-Learners: TypeAlias = Mapping[tuple[int, ...], AnyLearner]
+Learners: TypeAlias = Mapping[tuple[int, ...], Learner]
 """Learners, by the indices of their agents."""
 
 

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from cprl.commons.spaces import Spaces
 from cprl.keys import Turn
-from cprl.learners.protocol import AnyLearner
+from cprl.learners.learner import Learner
 from cprl.runs.schedule import OnNan
 from cprl.training.learning import LaneLosses
 from cprl.values.array_types import Float64
@@ -73,7 +73,7 @@ class FiniteCheck:
 
     def __init__(
         self,
-        learners: Mapping[tuple[int, ...], AnyLearner],
+        learners: Mapping[tuple[int, ...], Learner],
         spaces: Spaces,
         *,
         worlds: int = 1,

@@ -17,7 +17,7 @@ from cprl.envs.env_state import transforms_state
 from cprl.envs.unwrap import agent_names
 from cprl.experiment import Experiment
 from cprl.experiment.engine import about_engine, begun_with, engine_of, planned_updates
-from cprl.learners.protocol import AnyLearner
+from cprl.learners.learner import Learner
 from cprl.measuring.table import labelled, store_agent_names, where
 from cprl.measuring.tracker import Episode, try_custom_metrics
 from cprl.policies.asking import CALLS
@@ -452,7 +452,7 @@ def _summarise(run: _OpenRun, training: Training, evaluation: pa.Table, figure: 
     )
 
 
-def _trained_label(learners: Sequence[AnyLearner]) -> str:
+def _trained_label(learners: Sequence[Learner]) -> str:
     """Return the label of trained agents in tables, with the epsilons of those that explore by one.
 
     Examples: "trained", "trained, epsilon 0.05", "agents" if no agent learns.

@@ -14,12 +14,12 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
-from cprl import recurrent_state
 from cprl.commons.game import Game
 from cprl.commons.spaces import Spaces
 from cprl.envs.env_state import load_transforms_state
 from cprl.envs.make_env import make_env, spaces_of, stored_game
 from cprl.experiment import Experiment
+from cprl.keys import recurrent_state
 from cprl.networks.agent import acting_network
 from cprl.networks.finite import all_finite
 from cprl.networks.recurrent import state_cells_of

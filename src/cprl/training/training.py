@@ -16,13 +16,13 @@ from torchrl.collectors import BaseCollector
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from cprl import keys, recurrent_state
+from cprl import keys
 from cprl.commons.spaces import Spaces
 from cprl.envs.env_state import env_state, load_env_state, load_transforms_state, transforms_state
 from cprl.envs.make_env import check_env, spaces_of
 from cprl.envs.unwrap import commons_game_of
-from cprl.keys import Turn
-from cprl.learners.protocol import AnyLearner
+from cprl.keys import Turn, recurrent_state
+from cprl.learners.learner import Learner
 from cprl.measuring.series import Observer
 from cprl.measuring.tracker import Episode, example_episode, tracker_of, with_missing
 from cprl.policies.decisions import Decider
@@ -126,7 +126,7 @@ class Training:
     def __init__(
         self,
         env: EnvBase,
-        learners: Mapping[tuple[int, ...], AnyLearner],
+        learners: Mapping[tuple[int, ...], Learner],
         schedule: Schedule,
         *,
         others: Mapping[ActorAgents, nn.Module] | None = None,
@@ -465,7 +465,7 @@ def _states(parts: Sequence[Any]) -> list[dict[str, Any]]:
 
 def train(
     env: EnvBase,
-    learners: Mapping[tuple[int, ...], AnyLearner],
+    learners: Mapping[tuple[int, ...], Learner],
     schedule: Schedule,
     *,
     others: Mapping[ActorAgents, nn.Module] | None = None,

@@ -76,7 +76,11 @@ class Custom:
         return hash((self.target, json.dumps(self.arguments, sort_keys=True), self.live))
 
     def resolve(self) -> Any:
-        """Import the target and return it."""
+        """Import the target and return it.
+
+        Raises:
+            ValueError: if it cannot be imported, or is a live object of another process.
+        """
         if self.live:
             refuse_live([{"kind": "Custom", "target": self.target, "live": self.live}], only_foreign=True)
             return _LIVE[self.live]
@@ -93,7 +97,11 @@ class Custom:
         return target
 
     def make(self, *positional: Any) -> Any:
-        """Call the target with its arguments and return the result."""
+        """Call the target with its arguments and return the result.
+
+        Raises:
+            ValueError: if it cannot be imported, or does not take its arguments.
+        """
         target = self.resolve()
         try:
             return target(

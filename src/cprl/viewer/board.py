@@ -152,9 +152,9 @@ _SHOT_RADIUS_CELLS: Final = 0.1
 """The radius of the dot in each cell that a shot passes, in cells."""
 
 
-def image_format(size: tuple[int, int]) -> Any:
+def image_format(size: tuple[int, int], datatype: rr.ChannelDatatype = rr.ChannelDatatype.U8) -> Any:
     """Return the format of an image of classes, by its rows and columns."""
-    return rr.components.ImageFormat(width=size[1], height=size[0], channel_datatype=rr.ChannelDatatype.U8)
+    return rr.components.ImageFormat(width=size[1], height=size[0], channel_datatype=datatype)
 
 
 def board_format(scene: Scene) -> Any:

@@ -70,8 +70,8 @@ class ViewerCallback:
         live: "serve" or "spawn", see `cprl.viewer.live`; None writes the file only.
         exhibit: makes the view that plays the current policy for live viewers, see
             `cprl.experimental.exhibition`; None for no such view.
-        file_name: the name of the recording instead of `run.rrd`; this file must not exist.
-        is_replay: whether a stored policy is replayed, see `cprl.viewer.scene.Scene`.
+        replay: the name of a new recording beside those of the training, of an episode in which a stored
+            policy plays, see `Scene.is_replay`; None for a training.
         earlier: the boards of the games that the training plays before that of `env`.
     """
 
@@ -90,8 +90,7 @@ class ViewerCallback:
         recipe: Mapping[str, object] | None = None,
         live: str | None = None,
         exhibit: Exhibit | None = None,
-        file_name: str | None = None,
-        is_replay: bool = False,
+        replay: str | None = None,
         earlier: Sequence[Map] = (),
     ) -> None:
         self.env = env
@@ -107,16 +106,16 @@ class ViewerCallback:
                 max((board.height for board in earlier), default=0),
                 max((board.width for board in earlier), default=0),
             )
-            scene = scene_of(commons, curves, is_replay=is_replay, size=size)
-        self._earlier = [] if file_name else recordings_of(run)
+            scene = scene_of(commons, curves, is_replay=replay is not None, size=size)
+        self._earlier = [] if replay else recordings_of(run)
         self.logger = RerunLogger(
             title,
             run,
             curves=scene or curves,
             live=live,
             exhibits=exhibit is not None and scene is not None,
-            file_name=file_name or recording_file(len(self._earlier) + 1),
-            recording_id=recording_id(run, file_name or RECORDING_FILE),
+            file_name=replay or recording_file(len(self._earlier) + 1),
+            recording_id=recording_id(run, replay or RECORDING_FILE),
         )
         self.schedule = FrameSchedule(commons, self.logger, episodes=-(-episodes // worlds))
         self._turn = 0
@@ -149,7 +148,7 @@ class ViewerCallback:
         if exhibit is not None and served is not None and served.exhibition is not None:
             self.exhibition = exhibit(env, self.logger)
             self._views.append(self.exhibition)
-        if not is_replay:
+        if replay is None:
             header = Header(
                 curves=self.logger.curves, episodes=episodes, rules=self._rules(commons), is_about=is_about
             )
@@ -212,11 +211,7 @@ class ViewerCallback:
         self.header_view = HeaderView(logger, self.schedule, header)
         yield self.header_view
         if logger.live is not None:
-            yield CompilingNotice(self._show_status)
-
-    def _show_status(self, status: str) -> None:
-        if self.header_view is not None and self._episode == 0:
-            self.header_view.begins(status)
+            yield CompilingNotice(self.header_view.begins)
 
     def on_start(self, training: Any) -> None:
         """Continue the recording if the `Training` is resumed.

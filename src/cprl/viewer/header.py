@@ -21,7 +21,7 @@ from cprl.system.defaults import LAST_EPISODES
 from cprl.system.times import CLOCK
 from cprl.viewer.frames import FrameSchedule
 from cprl.viewer.logger import RerunLogger
-from cprl.viewer.names import EXPLORATION_STRIP, HEADER, LABEL_STRIP, SETTLED
+from cprl.viewer.names import EXPLORATION_STRIP, LABEL_STRIP, SETTLED
 from cprl.viewer.scene import Curves
 from cprl.viewer.view import Numbers, View, has_died
 
@@ -79,23 +79,15 @@ class Header:
     def _total(self) -> str:
         return f"of {'about ' * self.is_about}{self.episodes:,}"
 
-    def begins(self, status: str, random_play: float | None = None) -> str:
-        """Return the header before the first episode has ended.
-
-        Args:
-            status: e.g. "begins" or "compiling, 12 s so far".
-            random_play: the mean income of random play.
-        """
-        return self._text(f"Episode 1 {self._total}", status, self.amounts({"random play": random_play}))
-
     def line(
         self, *, episode: int, label: str, mean: float, random_play: float | None, died: int | None
     ) -> str:
-        """Return the header after an episode.
+        """Return the header after an episode, or before the first has ended.
 
         Args:
-            label: how the group does, e.g. "rising".
-            mean: the mean income of the last episodes.
+            label: how the group does, e.g. "rising", or "compiling, 12 s so far".
+            mean: the mean income of the last episodes; NaN before the first has ended.
+            random_play: the mean income of random play.
             died: how many boards died early in the episode; None for a game without stock.
         """
         amounts = self.amounts({"": mean, "random play": random_play})
@@ -208,7 +200,7 @@ class HeaderView(View):
         self._is_over = False
         # For viewers only: in the file of a resumed run this label would follow those of the earlier files.
         logger.log_row(LABEL_STRIP, rr.StateChange(state=BEGINS), live_only=True)
-        logger.log_document(HEADER, self.header.begins("begins"))
+        logger.log_header(self._line(BEGINS))
         logger.flush()
 
     def random_play(self, episodes: Sequence[Episode]) -> None:
@@ -216,18 +208,18 @@ class HeaderView(View):
         self._random_result = fresh_result(episodes, replicas=self._curves.replicas)
         self.course.random_play = self._random_result.harvest.value
         self._logger.log_text(f"random play {self._describe(self._random_result)}")
-        if not self._ended:
-            self.begins(BEGINS)
+        self.begins(BEGINS)
 
     def begins(self, status: str) -> None:
-        """Show a status in the live header before the first episode ends, e.g. "compiling, 12 s so far"."""
-        self._logger.show_live(HEADER, self.header.begins(status, self.course.random_play))
+        """Show a status in the live header, e.g. "compiling, 12 s so far", unless an episode has ended."""
+        if not self._ended:
+            self._logger.show_header(self._line(status))
 
     def change_rules(self, rules: str) -> None:
         """Name other institutions in the header from now on."""
         self.header = replace(self.header, rules=rules)
         if not self._ended:
-            self._logger.log_document(HEADER, self.header.begins(BEGINS, self.course.random_play))
+            self._logger.log_header(self._line(BEGINS))
 
     def on_episode(self, episode: Episode) -> None:
         income = _income(episode)
@@ -291,14 +283,16 @@ class HeaderView(View):
         label = self._label
         if self.course.explores:
             label += f", {EXPLORING}"
-        text = self.header.line(
-            episode=self._ended,
+        self._logger.log_header(self._line(label, died))
+
+    def _line(self, label: str, died: int | None = None) -> str:
+        return self.header.line(
+            episode=max(1, self._ended),
             label=label,
             mean=self.course.mean,
             random_play=self.course.random_play,
             died=died,
         )
-        self._logger.log_document(HEADER, text)
 
     @property
     def _learning(self) -> float:
@@ -317,7 +311,7 @@ class HeaderView(View):
         trained = fresh_result(played_by["trained"], replicas=replicas)
         random = fresh_result(played_by["random"], replicas=replicas)
         self._is_over = True
-        self._logger.log_document(HEADER, self.header.finished(self._learning, trained, random))
+        self._logger.log_header(self.header.finished(self._learning, trained, random))
         self._logger.log_text(f"finished: trained {self._describe(trained)}")
 
     def close(self) -> None:
@@ -328,11 +322,11 @@ class HeaderView(View):
         header = self.header.ended(f"{self.header.amounts({'': self._learning})} at the end")
         if self._ended + self._curves.worlds <= self.header.episodes and not self.header.is_about:
             header = self.header.stopped(self._ended, self.course.mean)
-        self._logger.log_document(HEADER, header)
+        self._logger.log_header(header)
 
     def _describe(self, result: FreshResult) -> str:
-        died = "" if result.died is None else f"; {result.died:,} of {result.episodes:,} boards died early"
-        return f"{result.harvest} {self._curves.unit}{died}"
+        harvest = f"{result.harvest} {self._curves.unit}"
+        return "; ".join(filter(None, (harvest, _deaths(result.died, result.episodes))))
 
 
 class Events(View):

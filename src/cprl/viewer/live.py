@@ -22,7 +22,7 @@ from cprl.system.compat.recordings import StoredLayout, keep_native
 from cprl.system.output import legible
 from cprl.values import checked
 from cprl.viewer.names import HEADER
-from cprl.viewer.page import LOCALHOST, Served, WebViewer, free_port, has_display, viewer
+from cprl.viewer.page import LOCALHOST, Served, WebViewer, free_port, has_display
 
 STALL_S: Final = 2.0
 """Seconds that a training waits for a place in the queue of a viewer that has stopped taking data."""
@@ -154,17 +154,16 @@ class LiveStream(Stream):
         out."""
         return self._queue.qsize() > 1
 
-    def send_text(self, recording: Any, name: str, text: str) -> None:
-        """Send a Markdown text without a time, which replaces the earlier one at every step.
+    def send_header(self, recording: Any, text: str) -> None:
+        """Send a header without a time, which replaces the earlier one at every step.
 
-        Call it through `call`. The server sends such a text before the history, so a viewer that connects
-        late never shows an old text as the present.
+        Call it through `call`. The server sends what has no time before the history, so a viewer that
+        connects late never shows an old header as the present.
         """
-        if name == HEADER:
-            self._header = text
-            if self._loading_browsers:
-                text = text.replace(" ", " History loads · ", 1)
-        recording.send_columns(name, [], rr.TextDocument.columns(text=[text]))
+        self._header = text
+        if self._loading_browsers:
+            text = text.replace(" ", " History loads · ", 1)
+        recording.send_columns(HEADER, [], rr.TextDocument.columns(text=[text]))
 
     def show_loading(self) -> None:
         """Say in the header that the history loads, for as long as a browser that opens the page needs.
@@ -181,7 +180,7 @@ class LiveStream(Stream):
     def _count_loading_browsers(self, recording: Any, change: int) -> None:
         self._loading_browsers += change
         if self._header:
-            self.send_text(recording, HEADER, self._header)
+            self.send_header(recording, self._header)
 
     def _call(self, function: Callable[[Any], object] | None) -> None:
         """Put a function into the queue of the thread; None ends the thread."""
@@ -263,9 +262,9 @@ class Live:
         self.exhibition: LiveStream | None = None
         if exhibits:
             self.exhibition = serve("exhibition", _EXHIBITION_MEMORY, send_properties=False)
-        if mode == "spawn":
-            _spawn(sources)
         self._page = WebViewer(*sources, opened=self.stream.show_loading)
+        if mode == "spawn":
+            _spawn(self._page.native)
         self.addresses = self._page.addresses
 
     def close(self) -> None:
@@ -333,7 +332,7 @@ def served(files: Sequence[Path]) -> Iterator[WebViewer]:
     page = WebViewer(source, opened=stream.show_loading)
     try:
         if header is not None:
-            stream.call(partial(stream.send_text, name=HEADER, text=header))
+            stream.call(partial(stream.send_header, text=header))
         for path in readable:
             stream.call(methodcaller("log_file_from_path", path))
         yield page
@@ -378,7 +377,7 @@ def _newest_header(readers: Sequence[RrdReader]) -> tuple[RrdReader, str | None]
     return newest_reader, newest_header
 
 
-def _spawn(sources: list[str]) -> None:
+def _spawn(command: Sequence[str]) -> None:
     """Start Rerun's native viewer in its own process; warn if it cannot open."""
     if not has_display():
         _warn_that_run_continues(
@@ -387,7 +386,7 @@ def _spawn(sources: list[str]) -> None:
         return
     try:
         subprocess.Popen(
-            [viewer(), "--connect", *sources],
+            command,
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,

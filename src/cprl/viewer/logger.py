@@ -32,6 +32,7 @@ from cprl.viewer.live import (
     Stream,
     open_file,
 )
+from cprl.viewer.names import HEADER
 from cprl.viewer.page import RECORDING_FILE
 from cprl.viewer.scene import Curves, Scene
 
@@ -70,11 +71,11 @@ def _time_columns(times: RowTimes) -> list[Any]:
 
 
 def send_buffer(stream: Stream) -> None:
-    """Send the buffered numbers and texts of one stream, one chunk per entity.
+    """Send the buffered numbers and headers of one stream, one chunk per entity.
 
-    A viewer gets only the newest text, without a time, see `LiveStream.send_text`. A file keeps each text
-    with its time: if several files of one recording had a text without a time, the viewer would show the one
-    that it loads last.
+    A viewer gets only the newest header, without a time, see `LiveStream.send_header`. A file keeps each
+    header with its time: if several files of one recording had one without a time, the viewer would show the
+    one that it loads last.
     """
     stream.call(partial(_send_rows, stream, stream.take_buffer()))
 
@@ -84,7 +85,7 @@ def _send_rows(stream: Stream, rows_by_entity: Mapping[str, Sequence[BufferedRow
     for entity, rows in rows_by_entity.items():
         steps, episodes, frames, values = zip(*rows, strict=True)
         if isinstance(stream, LiveStream) and isinstance(values[-1], str):
-            stream.send_text(recording, entity, values[-1])
+            stream.send_header(recording, values[-1])
             continue
         times = (steps, episodes, frames)
         if times not in time_columns:
@@ -277,22 +278,27 @@ class RerunLogger(Logger):
         """
         self._buffer(name, self.step, [float(value) for value in values])
 
-    def log_document(self, name: str, text: str) -> None:
-        """Log a Markdown text, which replaces the earlier one; it is sent with the buffered numbers."""
-        self._buffer(name, self.step, text)
+    def log_header(self, text: str) -> None:
+        """Log the header, a Markdown text, which replaces the earlier one; it is sent with the buffered
+        numbers."""
+        self._buffer(HEADER, self.step, text)
 
-    def show_live(self, name: str, text: str) -> None:
-        """Show a Markdown text to viewers at once, without writing it to the file; from any thread."""
+    def show_header(self, text: str) -> None:
+        """Show a header to viewers at once, without writing it to the file; from any thread."""
         for stream in self._streams:
             if isinstance(stream, LiveStream):
-                stream.call(partial(stream.send_text, name=name, text=text))
+                stream.call(partial(stream.send_header, text=text))
 
     def _buffer(self, name: str, step: int, values: list[float] | str) -> None:
         for stream in self._streams:
             stream.buffer.setdefault(name, []).append((step, self.episode, self.frames, values))
 
     def log_frames(self, frames: Frames) -> None:
-        """Log recorded frames, as `cprl.viewer.board.FrameRecorder.take` returns them."""
+        """Log recorded frames, as `cprl.viewer.frames.FrameRecorder.take` returns them.
+
+        Raises:
+            ValueError: if the recording shows no board.
+        """
         if self.scene is None:
             raise ValueError("the logger has no scene; pass a Scene as curves to log frames")
         frame_numbers = np.arange(self.frames, self.frames + len(frames["step"]))
@@ -314,6 +320,9 @@ class RerunLogger(Logger):
 
         A video starts after the last image of an earlier one with the same name, because TorchRL's recorders
         pass the number of the video as its step.
+
+        Raises:
+            ValueError: for a video of another shape.
         """
         images = torch.as_tensor(video).cpu()
         images = images[0] if images.ndim == 5 else images
@@ -333,7 +342,7 @@ class RerunLogger(Logger):
         self.log_row(name, rr.BarChart(counts, abscissa=(edges[:-1] + edges[1:]) / 2), step=step)
 
     def flush(self) -> None:
-        """Send all buffered numbers and texts, to the file and to viewers."""
+        """Send all buffered numbers and headers, to the file and to viewers."""
         for stream in self._streams:
             send_buffer(stream)
 

@@ -82,9 +82,11 @@ class WebViewer:
         )
         Thread(target=self._server.serve_forever, daemon=True).start()
         self.port = self._server.server_port
+        self.native = [viewer(), "--connect", *sources]
+        """The command of Rerun's native viewer."""
         self.addresses = {
             "browser": f"http://{LOCALHOST}:{self.port}/",
-            "native": quote_command([viewer(), "--connect", *sources]),
+            "native": quote_command(self.native),
         }
         """The address for a "browser", and the command line of Rerun's "native" viewer."""
 
@@ -204,6 +206,9 @@ def check_watch(watch: str, *, linger: bool = False, can_be_off: bool = True) ->
         linger: whether the recording stays served after the run. That needs a served recording, and the main
             thread, which waits for the signal to stop.
         can_be_off: whether "off" is allowed.
+
+    Raises:
+        ValueError: for another word, and where `linger` is not possible.
     """
     allowed: Any = Literal["file", Served, "off"] if can_be_off else Literal["file", Served]
     checked("watch", watch, allowed)

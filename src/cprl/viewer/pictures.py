@@ -325,19 +325,12 @@ class Pictures(View):
             ]
         if curves.has_lorenz:
             self._pictures.append(Picture(draw=draw_lorenz, every=every, axes=_LORENZ_AXES))
-        notice = rr.Points2D.columns(
-            positions=[TITLE],
-            labels=[f"lines from episode {ceil(every / curves.worlds) * curves.worlds} on"],
-            colors=[TEXT],
-            radii=[0.0],
-            show_labels=[True],
-        )
+        notice = _texts([TITLE], [f"lines from episode {ceil(every / curves.worlds) * curves.worlds} on"])
         for picture in self._pictures:
             if picture.axes is not None:
                 for entity, archetype in picture.axes.static_parts().items():
                     logger.log_static(entity, archetype)
-                title = f"{picture.axes.origin}/title"
-                logger.log_columns(title, ([0], [0], [0]), notice, live_only=True)
+                logger.log_row(f"{picture.axes.origin}/title", notice, live_only=True)
 
     def on_episode(self, episode: Episode) -> None:
         self._episodes.append(episode)

@@ -10,15 +10,16 @@ from numpy.typing import NDArray
 from tensordict import TensorDictBase
 from torch import nn
 
-from cprl import keys, recurrent_state
+from cprl import keys
 from cprl.envs.commons_env import CommonsEnv
+from cprl.keys import recurrent_state
 from cprl.measuring.registry import FINES_TOTAL, TRANSFERS_TOTAL
 from cprl.measuring.tracker import Episode
 from cprl.pictures.colours import agent_colour
 from cprl.policies.actors import LaneActor
 from cprl.policies.joint_policy import JointPolicy, agent_indices
 from cprl.values.array_types import Float32, Float64
-from cprl.viewer.board import centres_of
+from cprl.viewer.board import centres_of, image_format
 from cprl.viewer.logger import RerunLogger
 from cprl.viewer.names import BOARD_BACKGROUND, GIVEN, PAID
 from cprl.viewer.scene import BAR_GAP, BAR_HIGH, BAR_WIDE, Scene, decision_panels
@@ -62,9 +63,7 @@ class Decisions:
         self._actions = tuple(actions)
         self._actors = list(zip(map(agent_indices, policies.indices), policies.actors, strict=True))
         self._panels = decision_panels(len(scene.agents), len(actions), scene.window)
-        needs_16_bits = 2 * len(scene.agents) * len(actions) > np.iinfo(np.uint8).max
-        self._dtype = np.uint16 if needs_16_bits else np.uint8
-        self._images: list[NDArray[np.unsignedinteger[Any]]] = []
+        self._images: list[NDArray[np.uint16]] = []
         self._texts: list[str] = []
         """The texts of all agents, one frame after the other."""
         self._step = 0
@@ -76,7 +75,7 @@ class Decisions:
         if self._step == 1:
             return  # frames begin after the first turn, so no frame shows the first observations
         actions = batch[keys.ACTION][0].tolist()
-        image = np.zeros(self._panels.shape, self._dtype)
+        image = np.zeros(self._panels.shape, np.uint16)
         texts = list(self._names)
         for agents, actor in self._actors:
             for agent, (heights, text) in zip(agents, _bars(actor, batch, list(agents)), strict=True):
@@ -107,9 +106,6 @@ class Decisions:
 
     def _log_static_parts(self) -> None:
         """Log the format of the image, the classes of its bars, and the names of actions."""
-        rows, columns = self._panels.shape
-        kind = rr.ChannelDatatype.U16 if self._dtype is np.uint16 else rr.ChannelDatatype.U8
-        form = rr.components.ImageFormat(width=columns, height=rows, channel_datatype=kind)
         classes = [rr.AnnotationInfo(id=0, label="", color=BOARD_BACKGROUND)]
         for agent, name in enumerate(self._names):
             hue = tuple(round(_BAR_BRIGHTNESS * channel) for channel in agent_colour(agent))
@@ -119,7 +115,9 @@ class Decisions:
                 taken_label = f"{name} takes: {action_name}"
                 classes.append(rr.AnnotationInfo(id=bar_class, label=label, color=hue))
                 classes.append(rr.AnnotationInfo(id=bar_class + 1, label=taken_label, color=_WHITE))
-        image = rr.SegmentationImage.from_fields(format=form, opacity=1.0)
+        image = rr.SegmentationImage.from_fields(
+            format=image_format(self._panels.shape, rr.ChannelDatatype.U16), opacity=1.0
+        )
         self._logger.log_static(_DECISIONS, rr.AnnotationContext(classes), image)
         self._logger.log_static(f"{_DECISIONS}/labels", self._panels.labels())
         if len(self._names) <= _MOST_LABELLED:

@@ -105,7 +105,7 @@ class JoinRefusedError(Exception):
 class Budget:
     """A limit of messages: so many a second, and so many at once."""
 
-    def __init__(self, rate: float = 20.0, most: float = 40.0) -> None:
+    def __init__(self, rate: float, most: float) -> None:
         self.rate = rate
         self._most = most
         self._left = most
@@ -127,6 +127,7 @@ class Seat:
 
     group: int
     agent: int
+    budget: Budget
     code: str = ""
     secret: str = ""
     """The digest of its secret; "" for a seat that is free."""
@@ -141,7 +142,6 @@ class Seat:
     number: int = 0
     vote: int = NONE
     view: str = ""
-    budget: Budget = field(default_factory=Budget)
 
     def kept(self) -> dict[str, Any]:
         """Return what the session's file says of the person."""
@@ -210,8 +210,8 @@ class Hall:
 
     def close(self) -> None:
         """Close the files of the session, and release its folder."""
-        for this in self.rounds:
-            this.close()
+        for hosted_round in self.rounds:
+            hosted_round.close()
         self._closing.close()
 
     # the folder
@@ -354,24 +354,24 @@ class Hall:
             case messages.Seeing(view=view):
                 seat.view = view
             case messages.Action(action=action, number=number):
-                this = self._round_now("action", self.stage in ("practice", "playing"))
-                if action not in this.game.actions:
-                    raise ValueError(f"action is unknown; allowed: {', '.join(this.game.actions)}")
-                seat.action = this.game.actions.index(action)
+                hosted_round = self._round_now("action", self.stage in ("practice", "playing"))
+                if action not in hosted_round.game.actions:
+                    raise ValueError(f"action is unknown; allowed: {', '.join(hosted_round.game.actions)}")
+                seat.action = hosted_round.game.actions.index(action)
                 seat.number = number
                 self._changed.set()
             case messages.Choice(option=option):
-                this = self._round_now("vote")
-                if not this.game.decisions or this.turn:
+                hosted_round = self._round_now("vote")
+                if not hosted_round.game.decisions or hosted_round.turn:
                     raise ValueError("there is no vote now")
-                if option >= this.game.decisions:
-                    raise ValueError(f"option is {option}; allowed: 0 to {this.game.decisions - 1}")
+                if option >= hosted_round.game.decisions:
+                    raise ValueError(f"option is {option}; allowed: 0 to {hosted_round.game.decisions - 1}")
                 seat.vote = option
             case messages.Chat(text=text):
-                this = self._round_now("chat")
-                if not this.has_chat:
+                hosted_round = self._round_now("chat")
+                if not hosted_round.has_chat:
                     raise ValueError("there is no chat in this session")
-                this.keep_chat(seat.group, seat.agent, text, _ms())
+                hosted_round.keep_chat(seat.group, seat.agent, text, _ms())
                 line = {"from": self.session.names()[seat.agent], "text": text}
                 for other in self.seats:
                     if other.group == seat.group and other.consented:
@@ -419,24 +419,27 @@ class Hall:
         names[seat.agent] = "you"
         return names
 
-    def _send_round(self, seat: Seat, this: HostedRound) -> None:
+    def _send_round(self, seat: Seat, hosted_round: HostedRound) -> None:
         if seat.consented:
             names = self._names(seat)
-            seat.send("round", round=self._number, rounds=len(self.rounds), names=names, **this.fixed())
+            seat.send(
+                "round", round=self._number, rounds=len(self.rounds), names=names, **hosted_round.fixed()
+            )
 
-    def _send_turn(self, seat: Seat, this: HostedRound, view: dict[str, Any]) -> None:
+    def _send_turn(self, seat: Seat, hosted_round: HostedRound, view: dict[str, Any]) -> None:
         """Send a turn in the form that the seat asks for."""
         if seat.outbox is None or not seat.consented:
             return
         form = seat.view or self.session.view
         if form != "board":
-            view = this.narrowed(view, seat.group, seat.agent, form)
-        in_play = bool(this.in_play()[seat.group, seat.agent])
+            view = hosted_round.narrowed(view, seat.group, seat.agent, form)
+        in_play = bool(hosted_round.in_play()[seat.group, seat.agent])
         seat.outbox.show(messages.write("turn", **view, in_play=in_play, ack=seat.number))
 
     def _send_end(self, seat: Seat) -> None:
         rounds = [
-            {"rule": this.name, "trained": this.trained(), **this.result(seat.group)} for this in self.rounds
+            {"rule": hosted_round.name, "trained": hosted_round.trained(), **hosted_round.result(seat.group)}
+            for hosted_round in self.rounds
         ]
         seat.send("end", completion_code=seat.completion, names=self._names(seat), rounds=rounds)
 
@@ -452,9 +455,9 @@ class Hall:
         is_new = not (self.folder / "round-1").exists()
         if is_new:
             await self._stay("lobby", lambda: all(seat.is_here for seat in self.seats))
-        for this in [*(self._practice if is_new else ()), *self.rounds]:
-            if not this.is_finished:
-                await self._lead_through(this)
+        for hosted_round in [*(self._practice if is_new else ()), *self.rounds]:
+            if not hosted_round.is_finished:
+                await self._lead_through(hosted_round)
         self.stage = "end"
         for seat in self.seats:
             self._catch_up(seat)
@@ -477,31 +480,31 @@ class Hall:
                     self._changed.clear()
                     await self._changed.wait()
 
-    async def _lead_through(self, this: HostedRound) -> None:
+    async def _lead_through(self, hosted_round: HostedRound) -> None:
         """Let people read the rules of a round, and play it."""
-        await asyncio.to_thread(this.begin, self._table["id"])
-        self._round = this
+        await asyncio.to_thread(hosted_round.begin, self._table["id"])
+        self._round = hosted_round
         for seat in self.seats:
             seat.action = NONE
             seat.vote = NONE
             seat.is_ready = False
-            self._send_round(seat, this)
-        if this.turn:
+            self._send_round(seat, hosted_round)
+        if hosted_round.turn:
             await self._stay("paused", self._are_back, _BACK_WITHIN_SECONDS)
         else:
-            is_first = this is (self._practice or self.rounds)[0]
+            is_first = hosted_round is (self._practice or self.rounds)[0]
             stage = "instructions" if is_first else "between"
             await self._stay(stage, self._are_ready, self.session.pause_seconds)
-        await self._stay("practice" if this.folder is None else "playing")
-        self._send_turns(this)
+        await self._stay("practice" if hosted_round.folder is None else "playing")
+        self._send_turns(hosted_round)
         gc.collect()
         gc.freeze()  # a full collection would stop the clock for a quarter of a second
         await asyncio.sleep(_LAST_BOARD_SECONDS)
-        await self._run_clock(this)
+        await self._run_clock(hosted_round)
         self._round = None
-        await asyncio.to_thread(this.finish)
-        if this.folder is not None:
-            say(f"{this.folder}: round {this.number + 1}, {this.name}")
+        await asyncio.to_thread(hosted_round.finish)
+        if hosted_round.folder is not None:
+            say(f"{hosted_round.folder}: round {hosted_round.number + 1}, {hosted_round.name}")
         await asyncio.sleep(_LAST_BOARD_SECONDS)
 
     def _are_back(self) -> bool:
@@ -513,35 +516,35 @@ class Hall:
         ready = [seat.is_ready for seat in self.seats if seat.is_here]
         return bool(ready) and all(ready)
 
-    async def _run_clock(self, this: HostedRound) -> None:
+    async def _run_clock(self, hosted_round: HostedRound) -> None:
         """Play turns at the pace of the session until all groups have ended."""
         stage = self.stage
         due = time.monotonic()
-        while not this.is_over:
+        while not hosted_round.is_over:
             if self.session.turns_a_second:
                 due = max(due + 1 / self.session.turns_a_second, time.monotonic())
                 await asyncio.sleep(due - time.monotonic())
             else:
                 await asyncio.sleep(_LEAST_TURN_SECONDS)
-                await self._wait(lambda: self._have_chosen(this), self.session.choice_seconds)
+                await self._wait(lambda: self._have_chosen(hosted_round), self.session.choice_seconds)
             if not any(seat.is_here for seat in self.seats):
                 await self._stay("paused", lambda: any(seat.is_here for seat in self.seats))
                 await self._stay(stage)
-            self._play_turn(this)
+            self._play_turn(hosted_round)
 
-    def _have_chosen(self, this: HostedRound) -> bool:
+    def _have_chosen(self, hosted_round: HostedRound) -> bool:
         """Return whether all have chosen who are here and can."""
-        in_play = this.in_play()
+        in_play = hosted_round.in_play()
         here = [seat for seat in self.seats if seat.is_here]
         return bool(here) and all(seat.action != NONE or not in_play[seat.group, seat.agent] for seat in here)
 
-    def _play_turn(self, this: HostedRound) -> None:
+    def _play_turn(self, hosted_round: HostedRound) -> None:
         """Play a turn of all groups, keep it, and send it."""
-        action = this.nothing()
-        votes = this.nothing()
+        action = hosted_round.nothing()
+        votes = hosted_round.nothing()
         person = np.zeros(action.shape, np.bool_)
         given = np.zeros(action.shape, np.bool_)
-        stay = this.game.actions.index(STAY)
+        stay = hosted_round.game.actions.index(STAY)
         for seat in self.seats:
             agent = seat.group, seat.agent
             person[agent] = bool(seat.consented) and not seat.has_left_for(_ABSENT_AFTER_SECONDS)
@@ -550,20 +553,20 @@ class Hall:
             action[agent] = stay if stays and not given[agent] else seat.action
             votes[agent] = seat.vote
             seat.action = NONE
-        playing = [group for group in range(self.session.groups) if group not in this.episodes]
-        this.play(action, votes)
-        this.keep(playing, person, given, _ms())
-        self._send_turns(this)
+        playing = [group for group in range(self.session.groups) if group not in hosted_round.episodes]
+        hosted_round.play(action, votes)
+        hosted_round.keep(playing, person, given, _ms())
+        self._send_turns(hosted_round)
         for seat in self.seats:
-            if this.turn == 1 and this.game.ballots:
-                seat.send("vote", result=this.in_force(seat.group))
-            if seat.group in playing and seat.group in this.episodes:
-                seat.send("round_end", round=self._number, **this.result(seat.group))
+            if hosted_round.turn == 1 and hosted_round.game.ballots:
+                seat.send("vote", result=hosted_round.in_force(seat.group))
+            if seat.group in playing and seat.group in hosted_round.episodes:
+                seat.send("round_end", round=self._number, **hosted_round.result(seat.group))
 
-    def _send_turns(self, this: HostedRound) -> None:
-        views = this.views()
+    def _send_turns(self, hosted_round: HostedRound) -> None:
+        views = hosted_round.views()
         for seat in self.seats:
-            self._send_turn(seat, this, views[seat.group])
+            self._send_turn(seat, hosted_round, views[seat.group])
 
 
 def digest(secret: str) -> str:

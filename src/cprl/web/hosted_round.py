@@ -7,8 +7,8 @@ seed, and `HostedRound.begin` plays them again.
 """
 
 from base64 import b64encode
-from collections.abc import Mapping, Sequence
-from io import FileIO
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,8 +29,9 @@ from cprl.measuring.tracker import Episode, tracker_of
 from cprl.pictures.decoding import classes_seen, window_text
 from cprl.pictures.readable import instructions_of, options_of
 from cprl.population import AgentSpec, Person, has_people, partners_in
-from cprl.runs.episodes import append_batch, batches_in, stored_episodes
+from cprl.runs.episodes import stored_episodes
 from cprl.runs.files import REPORT, write_atomically
+from cprl.runs.journal import Journal, batches_in, read_journal
 from cprl.runs.played import write_played
 from cprl.runs.states import start
 from cprl.training.agents import Population
@@ -73,40 +74,8 @@ CHAT_COLUMNS: Final = pa.schema(
     {**{name: _COLUMNS[name] for name in ("turn", "ms", "group", "agent")}, "text": pa.string()}
 )
 """The columns of chat.parquet; "turn" is the one that was played last."""
-
-
-class Journal:
-    """Rows as an Arrow stream, unbuffered: what `add` wrote survives SIGKILL.
-
-    Args:
-        path: the file; an earlier one is read, and continued after its last whole batch.
-        schema: the columns.
-    """
-
-    def __init__(self, path: Path, schema: pa.Schema) -> None:
-        self.path = path
-        self.schema = schema
-        whole = list(batches_in(path)) if path.exists() else []
-        self.batches = [batch for batch, _ in whole]
-        end = whole[-1][1] if whole else 0
-        self._file = FileIO(path, "a")
-        self._file.truncate(end)
-        self._file.seek(end)
-
-    def add(self, columns: Mapping[str, Any]) -> None:
-        """Append rows: an array or a list for each column."""
-        arrays = [pa.array(columns[field.name], field.type) for field in self.schema]
-        batch = pa.record_batch(arrays, schema=self.schema)
-        append_batch(self._file, batch, is_first=not self.batches)
-        self.batches.append(batch)
-
-    def table(self) -> pa.Table:
-        """Return all rows."""
-        return pa.Table.from_batches(self.batches, self.schema)
-
-    def close(self) -> None:
-        """Close the file, which can be continued later."""
-        self._file.close()
+_COLUMNS_OF: Final = {"turns": TURN_COLUMNS, "chat": CHAT_COLUMNS}
+"""The columns of each file that is kept of a round, by its name."""
 
 
 class HostedRound:
@@ -142,7 +111,7 @@ class HostedRound:
         self.seed = session.seed + number
         self._runs = runs
         self._governor = session.governor_of(game, runs)
-        self._journals: list[Journal] = []
+        self._journals: dict[str, Journal] = {}
         self.episodes: dict[int, Episode] = {}
         """The episode of each group that has ended."""
         self._find_agents()
@@ -215,11 +184,8 @@ class HostedRound:
                 governor=self._governor,
             )
             start(self.folder, experiment, partners_in(experiment.specs), session=session_id)
-        self._journals = [
-            Journal(self.folder / "turns.arrows", TURN_COLUMNS),
-            Journal(self.folder / "chat.arrows", CHAT_COLUMNS),
-        ]
-        for batch in self._journals[0].batches:
+        self._journals = {name: Journal(self.folder / f"{name}.arrows") for name in _COLUMNS_OF}
+        for batch, _ in batches_in(self._journals["turns"].path):
             self._play_again(batch)
 
     def _play_again(self, batch: pa.RecordBatch) -> None:
@@ -292,9 +258,8 @@ class HostedRound:
         }
         for _, name in (keys.IN_PLAY, keys.HARVEST, keys.FIRED, keys.FINES):
             values[name] = agents.get(name, torch.zeros(())).numpy()
-        self._journals[0].add(
-            {name: np.broadcast_to(array, person.shape)[groups].ravel() for name, array in values.items()}
-        )
+        rows = {name: np.broadcast_to(array, person.shape)[groups].ravel() for name, array in values.items()}
+        self._journals["turns"].add(pa.record_batch(rows, TURN_COLUMNS))
 
     def _cells(self) -> Int64:
         now = self._env.worlds.now
@@ -305,22 +270,24 @@ class HostedRound:
         """Append a line of chat to the journal."""
         if self.folder is not None:
             row = {"turn": self.turn, "ms": ms, "group": group, "agent": agent, "text": text}
-            self._journals[1].add({name: [value] for name, value in row.items()})
+            self._journals["chat"].add(pa.RecordBatch.from_pylist([row], CHAT_COLUMNS))
 
     def finish(self) -> None:
         """Write the run: its episodes, turns.parquet, turns.csv and chat.parquet."""
         if self.folder is None:
             return
-        turns, chat = (journal.table() for journal in self._journals)
-        write_atomically(self.folder / "turns.csv", lambda file: write_csv(turns, file))
-        write_played(self.folder, [*self.episodes.values()], turns=turns, chat=chat)
+        tables = {
+            name: read_journal(journal.path, _COLUMNS_OF[name]) for name, journal in self._journals.items()
+        }
+        write_atomically(self.folder / "turns.csv", partial(write_csv, tables["turns"]))
+        write_played(self.folder, [*self.episodes.values()], **tables)
         self.close()
-        for journal in self._journals:
+        for journal in self._journals.values():
             journal.path.unlink()
 
     def close(self) -> None:
         """Close the journals, which a later process can continue."""
-        for journal in self._journals:
+        for journal in self._journals.values():
             journal.close()
 
     # what people see

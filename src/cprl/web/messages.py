@@ -59,6 +59,7 @@ from typing import Any, Final, Literal, TypeAlias
 
 from cprl.values import Natural, Value, build, short_repr
 from cprl.web.hosting import ShortText
+from cprl.web.scenes import compact_json
 
 MOST_BYTES: Final = 1024
 """The largest message that is read."""
@@ -153,4 +154,4 @@ def read_object(text: object, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
 
 def write(name: str, **fields: Any) -> str:
     """Return a message from the server as text."""
-    return json.dumps({"type": name, **fields}, separators=(",", ":"), allow_nan=False)
+    return compact_json({"type": name, **fields})

@@ -220,7 +220,11 @@ class Sandbox:
         }
 
     def trained(self) -> dict[str, Any]:
-        """Return an episode of the trained agents, turn by turn, and their averages over fresh episodes."""
+        """Return an episode of the trained agents, turn by turn, and their averages over fresh episodes.
+
+        Raises:
+            ValueError: if no agents are trained.
+        """
         if self._training is None or self.state()["state"] != "trained":
             raise ValueError("no agents are trained; press Train these first")
         run = load(self._training[0])

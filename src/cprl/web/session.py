@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal, TypeAlias
 
 from cprl.commons import maps
@@ -41,15 +42,18 @@ class HostedSession(Hosting, stored=False, called="session"):
             checked("session.agents", word, Literal["trained"] | ScriptedPolicy)
         checked("session.absent", self.absent, Literal["stay"] | ScriptedPolicy)
 
+    @cached_property
+    def _base(self) -> tuple[Game, LoadedRun | None]:
+        """Return the game before any treatment, and the run whose game it is."""
+        return game_and_run(self.game, "published") if isinstance(self.game, str) else (self.game, None)
+
     def games(self) -> list[tuple[str, Game]]:
         """Return the name and the game of each round, with a start for each agent.
 
         Raises:
             ValueError: for a round that people cannot play; names the round.
         """
-        game = self.game
-        if isinstance(game, str):
-            game, _ = game_and_run(game, "published")
+        game, _ = self._base
         rounds = self.rounds or (("the game", game),)
         games = [(name, self._game_of(name, game, rules)) for name, rules in rounds]
         if self.governor is not None and all(game.governor is None for _, game in games):
@@ -74,9 +78,9 @@ class HostedSession(Hosting, stored=False, called="session"):
             ValueError: if agents are to be "trained" and there is no run; for a run with transforms.
         """
         runs = [load(path) for path in self.runs]
-        if isinstance(self.game, str):
-            _, run = game_and_run(self.game, "published")
-            runs = [*([run] if run is not None else []), *runs]
+        _, base_run = self._base
+        if base_run is not None:
+            runs.insert(0, base_run)
         for run in runs:
             if run.experiment.transforms:
                 raise ValueError(f"{run.path} has transforms of its game, in which people cannot play")

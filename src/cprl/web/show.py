@@ -69,14 +69,14 @@ def show(
     check_beside(runs, tuple(titles), most=_MOST_RUNS)
     if out is not None:
         Page(out).refuse()
-    fresh = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
-    default_path = Path(run) / f"show-{fresh[0].replica}-{fresh[0].episode}.html"
+    episodes = fresh_episodes(runs, replica=replica, episode=episode, seed=seed)
+    default_path = Path(run) / f"show-{episodes[0].replica}-{episodes[0].episode}.html"
     path = Page(out or default_path)
     path.refuse()
-    print_descriptions(fresh)
-    data, episodes = data_of(fresh, titles)
-    path.write(page(_heading(fresh, data), begins(commons_game(fresh[0].run)), data))
-    return path, episodes
+    print_descriptions(episodes)
+    data, played_episodes = data_of(episodes, titles)
+    path.write(page(_heading(episodes, data), begins(commons_game(episodes[0].run)), data))
+    return path, played_episodes
 
 
 def begins(game: Game) -> str:
@@ -84,11 +84,11 @@ def begins(game: Game) -> str:
     return f"<p>{escape(growth_of(game))}</p>"
 
 
-def _heading(fresh: Sequence[FreshEpisode], data: dict[str, Any]) -> str:
+def _heading(episodes: Sequence[FreshEpisode], data: dict[str, Any]) -> str:
     """Return the title of a page: that of its single run, or how the agents and rules of its runs differ."""
-    if len(fresh) == 1:
+    if len(episodes) == 1:
         return str(data["populations"][0]["title"])
-    runs = [population.run for population in fresh]
+    runs = [episode.run for episode in episodes]
     agents = {learned(run.specs) for run in runs}
     rules = {(run.game.rules, run.game.institutions, run.experiment.custom_rules) for run in runs}
     adjective = "Same" if len(agents) == 1 else "Different"
@@ -134,26 +134,26 @@ def page(title: str, before: str, data: dict[str, Any] | None = None, after: str
 
 
 def data_of(
-    fresh: Sequence[FreshEpisode], titles: Sequence[str] = ()
+    episodes: Sequence[FreshEpisode], titles: Sequence[str] = ()
 ) -> tuple[dict[str, Any], tuple[Episode, ...]]:
     """Play the episodes; return the data that `show.js` draws, and the episodes."""
-    games = [commons_game(population.run) for population in fresh]
-    recorded = [record(population) for population in fresh]
-    populations = zip(titles or titles_of(fresh), fresh, recorded, strict=True)
+    games = [commons_game(episode.run) for episode in episodes]
+    recorded = [record(episode) for episode in episodes]
+    populations = zip(titles or titles_of(episodes), episodes, recorded, strict=True)
     return {
         "populations": [_population(*population) for population in populations],
-        "axis": max(played.last for played in recorded),
+        "axis": max(played.last_turn for played in recorded),
         "most": max(int(played.boards[-1].harvested.max()) for played in recorded),
         "legend": legend_of(games),
     }, tuple(played.episode for played in recorded)
 
 
-def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, Any]:
+def _population(title: str, episode: FreshEpisode, played: Recorded) -> dict[str, Any]:
     """Return the data about one run's agents, in the form that `show.js` reads.
 
     `data` is what changes from turn to turn: JSON, compressed by zlib and encoded in base64.
     """
-    game = commons_game(fresh.run)
+    game = commons_game(episode.run)
     moments = [
         {
             "harvest": world.harvested.tolist(),
@@ -172,13 +172,13 @@ def _population(title: str, fresh: FreshEpisode, played: Recorded) -> dict[str, 
     if fines.any() or any(institution.can_be_broken for institution in game.institutions):
         changing["fined"] = fines.round(3).tolist()
         counted.append("apples paid as fines")
-    outcome = f"apples still grow after {played.last:,} turns"
+    outcome = f"apples still grow after {played.last_turn:,} turns"
     if played.is_dead:
-        outcome = f"gone for good at turn {played.last:,}: no apple is left"
+        outcome = f"gone for good at turn {played.last_turn:,}: no apple is left"
     return {
         "title": title,
-        "which": fresh.description,
-        "about": about(fresh.run),
+        "which": episode.description,
+        "about": about(episode.run),
         "outcome": outcome,
         "isDead": played.is_dead,
         "counted": counted,

@@ -17,7 +17,7 @@ from cprl.measuring.registry import (
     COLLECTIVE_RETURN,
     EQUALITY,
     INCOME,
-    METRICS as REGISTERED,
+    METRICS,
     is_custom_metric,
     title,
 )
@@ -121,7 +121,7 @@ def duplicate_metrics(table: StudyTable, part: str) -> dict[str, str]:
     value as the other one in every window of the part.
     """
     rows = where(table.rows, part=part)
-    same_as = {name: metric.same_as for name, metric in REGISTERED.items() if metric.same_as in table.metrics}
+    same_as = {name: metric.same_as for name, metric in METRICS.items() if metric.same_as in table.metrics}
     return {
         metric: other
         for metric, other in same_as.items()

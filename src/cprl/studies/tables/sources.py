@@ -15,7 +15,16 @@ from cprl.envs.unwrap import clock_in
 from cprl.experiment import Experiment
 from cprl.measuring.outcome import RULE, outcome_of
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY, INSTITUTIONS, METRICS, TOTALS
-from cprl.measuring.table import ROW_ORDER, WINDOWS, by_replica, complete, stored_metrics, where, world_of
+from cprl.measuring.table import (
+    ROW_ORDER,
+    WINDOWS,
+    by_replica,
+    complete,
+    gain_metric,
+    stored_metrics,
+    where,
+    world_of,
+)
 from cprl.measuring.windows import episodes_after, episodes_per_world
 from cprl.population import any_learns, has_people
 from cprl.runs.episodes import read_episodes, read_rows
@@ -272,8 +281,7 @@ def _outcome_words(tables: Mapping[str, pa.Table]) -> list[str]:
         return []
     training = tables[TRAINING_PART]
     random = tables[RANDOM_PART]
-    number = COLLECTIVE_RETURN if COLLECTIVE_RETURN in random.column_names else INCOME
-    random_return = float(np.mean(where(random, agent=0)[number].to_numpy()))
+    random_return = float(np.mean(where(random, agent=0)[gain_metric(random)].to_numpy()))
     replicas = sorted(training["replica"].unique().to_pylist())
     outcomes = [outcome_of(where(training, replica=replica), random=random_return) for replica in replicas]
     return [outcome.word for outcome in outcomes]

@@ -242,9 +242,8 @@ class StudyTable:
             f"{len(self.rows):,} rows{without}."
         )
 
-    def write(self, path: Path | str) -> Path:
-        """Write the table to a parquet file, which `read` reads; replace an older file atomically."""
-        path = Path(path)
+    def as_arrow(self) -> pa.Table:
+        """Return the rows, with all else that the table holds as metadata."""
         held = {
             "format": STUDY_TABLE_FORMAT,
             "versions": versions(),
@@ -255,8 +254,12 @@ class StudyTable:
             "made": self.provenance,
             **{name: getattr(self, name) for name in _HELD},
         }
-        rows = self.rows.replace_schema_metadata({METADATA: json.dumps(held)})
-        write_table(path, rows, over=True)
+        return self.rows.replace_schema_metadata({METADATA: json.dumps(held)})
+
+    def write(self, path: Path | str) -> Path:
+        """Write the table to a parquet file, which `read` reads; replace an older file atomically."""
+        path = Path(path)
+        write_table(path, self.as_arrow(), over=True)
         return path
 
     def to_csv(self) -> str:

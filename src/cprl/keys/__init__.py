@@ -2,6 +2,8 @@
 
 Axes have the same letters everywhere: B worlds, N agents, H x W the board, K sites, T time, A actions,
 R replicas, C channels, X rows and Y columns of an agent's window (farthest row first, the agent's row too).
+
+The module `recurrent_state` passes the states of recurrent networks from one turn to the next.
 """
 
 from typing import Final, NamedTuple
