@@ -315,7 +315,7 @@ def test_one_replica_has_no_interval_and_an_experiment_of_ones_own_no_published_
     see_that_the_legend_is_whole(drawn[0])
 
 
-def test_a_run_marks_where_the_exploration_of_its_agents_ends(tmp_path, drawn):
+def test_a_run_marks_where_the_exploration_of_its_agents_ends(tmp_path, drawn, curves):
     settings = DQNSettings(epsilon_hold_steps=3, epsilon_decay_steps=12, learning_starts=2, hidden_cells=(2,))
     experiment = cprl.Experiment(
         name="meadow",
