@@ -36,9 +36,10 @@ from cprl.experimental.exhibition import EXHIBITED_WORLD, Exhibition
 from cprl.learners.lanes import Lanes
 from cprl.measuring import Episode
 from cprl.measuring.series import Observer
-from cprl.policies.actors import random_agents
+from cprl.population import Scripted
 from cprl.system.process import prepare_process
 from cprl.training import Schedule, Training
+from cprl.training.agents import Population
 from cprl.viewer.callback import ViewerCallback
 
 AGENTS: Final = (0, 1, 2, 3)
@@ -173,7 +174,7 @@ def size(run: Path, episodes: int) -> tuple[int, int]:
     game = presets.game("commons")
     env = CommonsEnv(game, REPLICAS, seed=0)
     rng = np.random.default_rng(0)
-    at_random = random_agents(game.spaces, AGENTS, replicas=REPLICAS, seed=0)
+    at_random = Population(env, (Scripted(),) * game.agents).others
     with ViewerCallback(run, env, title="size", episodes=episodes) as watch:
         witness = Witness(watch)
         observer = Observer([watch], env)

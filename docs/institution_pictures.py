@@ -14,7 +14,7 @@ from cprl.commons.batch import Batch
 from cprl.institutions import COUNT_NAMES, Institution
 from cprl.pictures.colours import agent_colour
 from cprl.pictures.image import world_image
-from cprl.policies.scripted import ScriptedActor, ScriptedPolicy
+from cprl.policies.scripted import Plan, ScriptedActor, ScriptedPolicy
 from cprl.terminal.style import MARK, MEAN, RAW
 
 SEED: Final = 3
@@ -95,7 +95,7 @@ def _numbers(game: Game, text: str) -> list[int]:
 
 def _scripted(game: Game, policy: ScriptedPolicy) -> Callable[[int, Any], Any]:
     seeds = [(SEED, agent) for agent in range(game.agents)]
-    actor = ScriptedActor(policy, game, seeds=seeds, agents=game.agents)
+    actor = ScriptedActor(Plan(policy), game, seeds=seeds, agents=game.agents)
     return lambda turn, output: actor.choose(torch.from_numpy(output.observation)).numpy()
 
 

@@ -10,7 +10,7 @@ import tyro
 from cprl import CommonsEnv, presets
 from cprl.measuring.playing import evaluate, mean_return
 from cprl.policies.joint_policy import JointPolicy
-from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedActor
+from cprl.policies.scripted import SCRIPTED_POLICIES, Plan, ScriptedActor
 
 
 def main(*, board: presets.Board = "commons", episodes: int = 20, seed: int = 0) -> None:
@@ -20,7 +20,7 @@ def main(*, board: presets.Board = "commons", episodes: int = 20, seed: int = 0)
     print("| policy | return of all | steps | apples left | shots | tagged |\n|---|---:|---:|---:|---:|---:|")
     for policy in SCRIPTED_POLICIES:
         seeds = [(seed, agent) for agent in everyone]
-        actor = ScriptedActor(policy, game, seeds=seeds, agents=len(everyone), worlds=episodes)
+        actor = ScriptedActor(Plan(policy), game, seeds=seeds, agents=len(everyone), worlds=episodes)
         played = evaluate(CommonsEnv(game, episodes, seed=seed), JointPolicy({everyone: actor}))
         return_, error = mean_return(played)
         numbers = [

@@ -19,7 +19,7 @@ from cprl.envs.commons_env import CommonsEnv
 from cprl.measuring.playing import evaluate
 from cprl.measuring.statistics import difference, estimate
 from cprl.policies.joint_policy import JointPolicy
-from cprl.policies.scripted import ScriptedActor
+from cprl.policies.scripted import Plan, ScriptedActor
 from cprl.system.defaults import SEED
 from cprl.values.array_types import Float64
 
@@ -245,7 +245,7 @@ def _greedy_returns(game: Game) -> Float64:
     nearest apple."""
     agents = range(game.agents)
     seeds = [(SEED, agent) for agent in agents]
-    actor = ScriptedActor("greedy", game, seeds=seeds, agents=game.agents, worlds=GREEDY_WORLDS)
+    actor = ScriptedActor(Plan("greedy"), game, seeds=seeds, agents=game.agents, worlds=GREEDY_WORLDS)
     played = evaluate(CommonsEnv(game, GREEDY_WORLDS, seed=SEED), JointPolicy({tuple(agents): actor}))
     return np.array([float(episode.return_.sum()) for episode in played])
 

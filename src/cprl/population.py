@@ -6,6 +6,7 @@ specifications stand for one agent each and take the remaining agent indices in 
 """
 
 import os
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from posixpath import normpath
@@ -234,8 +235,7 @@ def learned(by_agent: Sequence[AgentSpec]) -> str:
     Args:
         by_agent: the specification of each agent, see `specs_by_agent`.
     """
-    descriptions = [_describe(spec) for spec in by_agent]
-    counts = {description: descriptions.count(description) for description in descriptions}
+    counts = Counter(map(_describe, by_agent))
     return ", ".join(_count(description, count) for description, count in counts.items())
 
 

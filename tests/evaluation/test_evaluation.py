@@ -15,6 +15,7 @@ import torch
 from matrix_games import prisoners_dilemma
 from PIL import Image
 from places import ROOT
+from random_agents import random_agents
 from stored_runs import (
     C51,
     CORRIDORS,
@@ -55,7 +56,7 @@ from cprl.measuring.registry import INCOME_EQUALITY, with_unit
 from cprl.measuring.statistics import estimates
 from cprl.measuring.table import all_metrics, where
 from cprl.networks.mlp import MLPNetwork
-from cprl.policies.actors import LaneActor, random_agents
+from cprl.policies.actors import LaneActor
 from cprl.policies.joint_policy import JointPolicy
 from cprl.population import Frozen, Scripted
 from cprl.runs.checkpoints import Checkpointer
@@ -229,7 +230,7 @@ def test_an_agent_values_actions_alone_as_among_others_to_the_last_bit():
     spaces = presets.game("two_complex").spaces
     shape = spaces.observation_shape
     torch.manual_seed(0)
-    agents = [StoredAgent(network=MLPNetwork(shape, 8), algorithm="DQN") for _ in range(8)]
+    agents = [StoredAgent(spec=DQN, network=MLPNetwork(shape, 8)) for _ in range(8)]
     seen = torch.randint(0, 256, (8, 1, *shape), dtype=torch.uint8)
 
     def values(lanes):

@@ -7,11 +7,13 @@ import sys
 
 import pytest
 import torch
+from matrix_games import stag_hunt
 from places import ROOT
 from stored_runs import command, stored
 
 from cprl import CommonsEnv, Game, River, Rules, keys, maps, presets
 from cprl.commands.play_by_keys import board_text, help_of, keys_of, play_in_terminal
+from cprl.envs.make_env import make_env
 from cprl.evaluation.play import Session, open_session
 from cprl.measuring.tracker import EpisodeTracker
 
@@ -224,6 +226,11 @@ def test_what_cannot_be_played_is_refused(tmp_path, monkeypatch, capsys, words, 
         file.truncate(10_000_001)
     with pytest.raises(SystemExit, match=said):
         command(monkeypatch, capsys, "play", *words)
+
+
+def test_a_person_plays_no_other_game_than_the_commons():
+    with pytest.raises(ValueError, match=r"env is .*allowed: a CommonsEnv"):
+        Session(make_env(stag_hunt(turns=2)), lambda moment: moment)
 
 
 def test_agents_of_no_replica_are_refused(run):

@@ -38,7 +38,7 @@ def test_a_replay_is_the_episode_of_a_group_turn_by_turn(game, tmp_path):
         episode = where(read_episodes(run), replica=group)
         assert recorded.episode.harvest.tolist() == episode["harvest"].to_pylist()
         assert recorded.episode.return_.tolist() == episode["return"].to_pylist()
-        assert recorded.last == episode["steps"][0].as_py()
+        assert recorded.last_turn == episode["steps"][0].as_py()
 
 
 def test_the_group_that_is_shown_is_a_typical_one_and_is_said_to_be_of_people(run):

@@ -79,7 +79,7 @@ def test_auto_is_the_default_and_what_a_recipe_or_a_study_that_says_nothing_mean
 
 
 def test_a_population_has_no_length_and_refuses_auto():
-    with pytest.raises(ValueError, match=r"engine is 'auto'; allowed: .* is for an Experiment"):
+    with pytest.raises(ValueError, match=r"engine is 'auto'; allowed: 'compiled'"):
         Population(CommonsEnv(SHORT.game, 1), SHORT.agents, engine="auto")
 
 

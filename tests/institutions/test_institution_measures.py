@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, settings, strategies as st
+from random_agents import random_agents
 from torchrl.envs import StepCounter, TransformedEnv
 from torchrl.envs.utils import RandomPolicy
 from written_episodes import all_written_out, turn
@@ -40,7 +41,6 @@ from cprl.measuring.registry import (
 from cprl.measuring.series import numbers_of
 from cprl.measuring.statistics import estimates
 from cprl.measuring.table import all_metrics
-from cprl.policies.actors import random_agents
 from cprl.runs.curves import as_curves
 from cprl.runs.episodes import (
     INSTITUTION_COLUMNS as COLUMNS,

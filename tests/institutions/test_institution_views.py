@@ -10,6 +10,7 @@ from drawings import frames_of
 from matplotlib.image import imread
 from paying_game import Charges
 from places import ROOT
+from random_agents import random_agents
 from recordings import column, names, static
 from rerun.chunk import RrdReader
 from rich.console import Console
@@ -25,7 +26,6 @@ from cprl.measuring.statistics import estimates, number_format
 from cprl.measuring.table import where
 from cprl.pictures.episode_picture import EpisodePicture
 from cprl.pictures.image import regions_of
-from cprl.policies.actors import random_agents
 from cprl.population import Scripted
 from cprl.runs.episodes import read_episodes
 from cprl.terminal.figures import training_curve

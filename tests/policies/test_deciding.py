@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 from hypothesis import given, strategies as st
+from random_agents import random_agents
 from stock_collector import stock_collector
 from stored_runs import episodes_of
 from torchrl.envs.utils import ExplorationType, set_exploration_type
@@ -22,7 +23,6 @@ from cprl.experimental.exhibition import policy_and_world
 from cprl.institutions import Sanctioner, Tax, Vote
 from cprl.institutions.votes import choice_of
 from cprl.measuring.playing import evaluate, turns
-from cprl.policies.actors import random_agents
 from cprl.policies.decisions import UNTRIED, Bandit, BanditDecider, Decider, choices_of, decision_of
 from cprl.policies.joint_policy import JointPolicy
 from cprl.population import Frozen, Learning, Scripted, Team
@@ -160,14 +160,16 @@ def test_exploration_decays_with_the_episodes_of_each_replica():
 
 
 def test_the_best_choice_is_taken_and_of_equal_ones_the_first():
-    values = np.array([[[2.0, 2.0, 1.0, 5.0, 5.0], [UNTRIED, -3.0, UNTRIED, UNTRIED, UNTRIED]]])
-    decider = Decider((2, 3), seeds=[(0,), (1,)], agents=2, values=values)
+    values = torch.tensor([[2.0, 2.0, 1.0, 5.0, 5.0], [UNTRIED, -3.0, UNTRIED, UNTRIED, UNTRIED]])
+    stored = {0: values[:1], 1: values[1:]}
+    decider = Decider((2, 3), seeds=[(0,), (1,)], agents=2, stored=stored)
     # Agent 0: choices 0 and 1, so 0 + 2 x 1; agent 1: choices 1 and, of three that it never made, 0.
     assert decider.decide(due((True, True))).tolist() == [[2, 1]]
 
 
 def test_agents_choose_anew_only_on_the_ballots_that_are_due():
-    decider = Decider((2, 3), seeds=[(0,)], agents=1, worlds=2, values=np.array([[[0.0, 1, 0, 0, 1]]]))
+    stored = {0: torch.tensor([[0.0, 1, 0, 0, 1]])}
+    decider = Decider((2, 3), seeds=[(0,)], agents=1, worlds=2, stored=stored)
     assert decider.decide(due((True, False), (False, True))).tolist() == [[1], [4]]
     before = decider.decide(due((False, False), (False, False)))
     decider.values[0, 0] = [1, 0, 1, 0, 0]
@@ -177,7 +179,7 @@ def test_agents_choose_anew_only_on_the_ballots_that_are_due():
 
 
 def test_agents_by_chance_make_every_choice_equally_often_whatever_the_exploration():
-    decider = Decider((2, 3), seeds=[(0,), (1,)], agents=2, worlds=3000)
+    decider = Decider((2, 3), seeds=[(0,), (1,)], agents=2, worlds=3000, stored={})
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         found = decider.decide(torch.ones(3000, 2, dtype=torch.bool))
     for agent in range(2):
@@ -321,8 +323,8 @@ def test_a_person_who_decides_is_heard():
     rates = set()
     for decision in (0, 1):
         env.set_seed(1)
-        values = np.array([[[0.0, 1.0], [1.0, 0.0], [0.0, 0.0]]])
-        decider = Decider((2,), seeds=[(0,)] * 3, agents=3, values=values)
+        stored = dict(enumerate(torch.tensor([[[0.0, 1.0]], [[1.0, 0.0]], [[0.0, 0.0]]])))
+        decider = Decider((2,), seeds=[(0,)] * 3, agents=3, stored=stored)
         others = JointPolicy(by_chance(), decisions=decider)
         session = Session(env, others, agent=2, decision=decision)
         session.act("stay")
@@ -404,8 +406,9 @@ def test_decisions_are_learned_from_what_an_agent_wants():
 def test_decisions_are_given_where_they_are_asked_for_and_nowhere_else():
     with pytest.raises(ValueError, match=r"Bandit.step_size is 0"):
         Bandit(step_size=0)
+    decider = Decider((3,), seeds=[(0,)], agents=1, stored={})
     with pytest.raises(ValueError, match="3 actors, and decisions of 1 agents"):
-        JointPolicy(by_chance(), decisions=Decider((3,), seeds=[(0,)], agents=1))
+        JointPolicy(by_chance(), decisions=decider)
     env = make_env(MEADOW, worlds=1)
     population = Population(env, (Scripted(),) * 3)
     with pytest.raises(ValueError, match="decisions is None"):

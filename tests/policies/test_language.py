@@ -19,7 +19,7 @@ from cprl.policies.asking import Calls
 from cprl.policies.joint_policy import JointPolicy
 from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_seeds
-from cprl.policies.scripted import ScriptedActor, scripted_lanes
+from cprl.policies.scripted import Plan, ScriptedActor, scripted_lanes
 from cprl.population import Scripted
 from cprl.values import from_config, to_config
 
@@ -167,12 +167,14 @@ def test_a_plan_says_where_an_agent_harvests_and_whom_it_tags():
         assert "0 agent_0, 1 agent_1" in prompts(server)[0]
         assert "Your last plan: aggressive, spare 3, region 2, 0, tag [1]." in prompts(server)[-1]
     seeds = lane_seeds(1, replicas=[0], agents=range(4), purpose=Purpose.EVALUATION)
-    script = ScriptedActor("aggressive", board, seeds=seeds, agents=4, region=(2, 0), tag=(1,))
+    script = ScriptedActor(Plan("aggressive", region=(2, 0), tag=(1,)), board, seeds=seeds, agents=4)
     assert torch.equal(planned, played(board, script))
-    assert not torch.equal(planned, played(board, ScriptedActor("aggressive", board, seeds=seeds, agents=4)))
+    assert not torch.equal(
+        planned, played(board, ScriptedActor(Plan("aggressive"), board, seeds=seeds, agents=4))
+    )
     for region, tag in (([5, 0], [1]), ([0, 3], [1]), ([0, 0], [4])):
         with pytest.raises(ValueError, match="allowed"):
-            actor._answers.read({"policy": "greedy", "region": region, "tag": tag})
+            actor._read({"policy": "greedy", "region": region, "tag": tag})
 
 
 def test_a_message_is_read_by_all_other_agents_of_the_world_from_the_next_turn_on_and_in_its_episode_alone():

@@ -13,7 +13,7 @@ from cprl import CommonsEnv, Game, Observation, River, Rules, maps, presets
 from cprl.commons.rules import ACTIONS
 from cprl.measuring.playing import evaluate
 from cprl.policies.joint_policy import JointPolicy
-from cprl.policies.scripted import SCRIPTED_POLICIES, ScriptedActor
+from cprl.policies.scripted import SCRIPTED_POLICIES, Plan, ScriptedActor
 
 
 class Stays(nn.Module):
@@ -38,7 +38,7 @@ class Scene(Play):
         )
         seeds = [(seed, world) for world in range(worlds)]
         numbers = {"spare": spare, "region": region, "tag": tag}
-        actor = ScriptedActor(policy, self.game, seeds=seeds, agents=1, **numbers)
+        actor = ScriptedActor(Plan(policy, **numbers), self.game, seeds=seeds, agents=1)
         others = {agent: Stays(self.game.actions.index("stay")) for agent in range(1, self.game.agents)}
         self.policy = JointPolicy({(0,): actor, **others})
         self.env = CommonsEnv(self.game, worlds, seed=seed)
@@ -224,13 +224,13 @@ def test_aggressive_pursues_those_whom_it_is_to_tag():
 def test_a_region_beyond_the_window_and_agents_that_are_not_there_or_look_alike_are_refused(numbers, words):
     game = Game(map=maps.parse(">.A\n<.."), rules=Rules(window_rows=3, window_columns=3))
     with pytest.raises(ValueError, match=words):
-        ScriptedActor("greedy", game, seeds=[(0,)], agents=1, **numbers)
+        ScriptedActor(Plan("greedy", **numbers), game, seeds=[(0,)], agents=1)
 
 
 def test_two_agents_that_want_one_cell_wait_at_random_until_one_gets_it():
     game = Game(map=maps.parse(">A<\n#.#"), rules=Rules(regrow_prob=(0.0,)))
     seeds = [(0, lane) for lane in range(20)]
-    actor = ScriptedActor("greedy", game, seeds=seeds, agents=2)
+    actor = ScriptedActor(Plan("greedy"), game, seeds=seeds, agents=2)
     ends = evaluate(CommonsEnv(game, 10, seed=0), JointPolicy({(0, 1): actor}))
     harvest = np.array([episode.harvest for episode in ends])
     assert harvest.sum(1).tolist() == [1] * 10
@@ -246,7 +246,7 @@ def test_agents_that_wait_stay_also_where_they_may_clean():
 
 def population(policy, game, worlds, seed=0):
     seeds = [(seed, agent) for agent in range(game.agents)]
-    actor = ScriptedActor(policy, game, seeds=seeds, agents=game.agents, worlds=worlds)
+    actor = ScriptedActor(Plan(policy), game, seeds=seeds, agents=game.agents, worlds=worlds)
     return evaluate(CommonsEnv(game, worlds, seed=seed), JointPolicy({tuple(range(game.agents)): actor}))
 
 
@@ -296,7 +296,7 @@ def test_actions_do_not_depend_on_the_form_of_the_observation(policy, may_fire):
     courses = []
     for form in FORMS:
         game = Game(map=walled, rules=rules, observation=form)
-        actor = ScriptedActor(policy, game, seeds=[(1, lane) for lane in range(9)], agents=3)
+        actor = ScriptedActor(Plan(policy), game, seeds=[(1, lane) for lane in range(9)], agents=3)
         agents, env = JointPolicy({(0, 1, 2): actor}), CommonsEnv(game, 3, seed=0)
         courses.append(env.rollout(40, agents, break_when_any_done=False)["agents", "action"])
     assert courses[0].max() < len(game.actions)
@@ -315,12 +315,12 @@ def test_the_actions_of_a_lane_do_not_depend_on_other_lanes(policy):
     game = presets.game("commons")
     seen = windows(game, 6)  # 2 replicas x 3 worlds, of which agents 1 and 3
     seeds = [(5, replica, agent) for replica in range(2) for agent in (1, 3)]
-    everyone = ScriptedActor(policy, game, seeds=seeds, agents=2, worlds=3)
+    everyone = ScriptedActor(Plan(policy), game, seeds=seeds, agents=2, worlds=3)
     everyone.epsilon = 0.3
     together = [everyone.choose(seen[:, [1, 3]]) for _ in range(30)]
     for lane, seed in enumerate(seeds):
         replica, agent = divmod(lane, 2)
-        alone = ScriptedActor(policy, game, seeds=[seed], agents=1, worlds=3)
+        alone = ScriptedActor(Plan(policy), game, seeds=[seed], agents=1, worlds=3)
         alone.epsilon = 0.3
         own = slice(3 * replica, 3 * replica + 3)
         for chosen in together:
@@ -331,7 +331,7 @@ def test_the_actions_of_a_lane_do_not_depend_on_other_lanes(policy):
 @pytest.mark.integration
 def test_epsilon_is_the_probability_of_a_random_action_while_exploring():
     game = Game(map=maps.parse("A..\n...\n^.."), rules=Rules())
-    actor = ScriptedActor("greedy", game, seeds=[(lane,) for lane in range(4000)], agents=1)
+    actor = ScriptedActor(Plan("greedy"), game, seeds=[(lane,) for lane in range(4000)], agents=1)
     seen = CommonsEnv(game, 4000, seed=0).reset()["agents", "observation"]
     actor.epsilon = 0.4
     counts = torch.bincount(actor.choose(seen)[:, 0], minlength=8)
@@ -346,7 +346,7 @@ def test_an_actor_continues_from_the_state_of_another():
     seen = windows(game, 2)
 
     def made():
-        return ScriptedActor("random", game, seeds=[(0, lane) for lane in range(4)], agents=2)
+        return ScriptedActor(Plan("random"), game, seeds=[(0, lane) for lane in range(4)], agents=2)
 
     one, other = made(), made()
     for _ in range(7):
@@ -359,4 +359,4 @@ def test_an_actor_continues_from_the_state_of_another():
 def test_a_game_whose_observations_are_no_windows_is_refused():
     game = replace(presets.game("commons"), observation=Observation(area="full"))
     with pytest.raises(ValueError, match=r"Observation\.area is 'full'"):
-        ScriptedActor("greedy", game, seeds=[(0,)], agents=1)
+        ScriptedActor(Plan("greedy"), game, seeds=[(0,)], agents=1)

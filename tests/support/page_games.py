@@ -13,7 +13,7 @@ from cprl import CommonsEnv, Game, Rules, maps, presets
 from cprl.commons import chance
 from cprl.institutions import Quota
 from cprl.policies.rng import Purpose, lane_seeds
-from cprl.policies.scripted import ScriptedActor
+from cprl.policies.scripted import Plan, ScriptedActor
 from cprl.web.playable import playable
 
 EVERY = 100
@@ -48,7 +48,7 @@ def actors_of(case):
     for policy in dict.fromkeys(case.policies or ()):
         agents = [i for i, name in enumerate(case.policies) if name == policy]
         seeds = lane_seeds(case.seed, replicas=replicas, agents=agents, purpose=Purpose.EVALUATION)
-        actors.append((agents, ScriptedActor(policy, case.game, seeds=seeds, agents=len(agents))))
+        actors.append((agents, ScriptedActor(Plan(policy), case.game, seeds=seeds, agents=len(agents))))
     return actors
 
 

@@ -204,6 +204,21 @@ def test_a_stored_run_is_evaluated_exported_frozen_and_described(finished, tmp_p
         cprl.run(mixed, tmp_path / "mixed", watch="off")
 
 
+@pytest.mark.integration
+def test_calls_of_a_frozen_language_agent_are_kept_in_the_run_in_which_it_is_frozen(tmp_path):
+    quiet = {"watch": "off", "figures": False}
+    fields = {"episodes": 1, "replicas": 1, "evaluation_episodes": 1}
+    with served() as server:
+        first = cprl.run(experiment(language(server.url), **fields), tmp_path / "first", **quiet)
+        kept = read_calls(first / CALLS)
+        frozen = [Frozen(os.path.relpath(first), agent) for agent in range(3)]
+        mixed = experiment(None, agents=(*frozen, Scripted("greedy")), **fields)
+        second = cprl.run(mixed, tmp_path / "second", **quiet)
+        cprl.evaluate_run(second, Fresh(episodes=1, seed=9))
+    assert read_calls(first / CALLS) == kept
+    assert any("seed 9" in call["call"] for call in read_calls(second / CALLS).values())
+
+
 def test_learning_agents_learn_beside_language_agents(tmp_path):
     with served() as server:
         agents = (Learning(ALGORITHMS["DQN"]), *(language(server.url),) * 2, Scripted("greedy"))

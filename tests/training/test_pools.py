@@ -284,7 +284,7 @@ def test_a_stored_pool_is_loaded_evaluated_crossed_exported_and_frozen(tmp_path,
     assert loaded.replicas == [0, 1]
     pool = loaded.agent(1, replica=1)
     assert len(pool.pool) == 5
-    assert [opponent.scripted for opponent in pool.pool] == [None, None, "random", None, None]
+    assert [opponent.spec for opponent in pool.pool] == [DQN, PPO, Scripted("random"), DQN, DQN]
     names = [name for name in loaded.networks if name.startswith("replica_1/agent_1/past_")]
     assert [opponent.network for opponent in pool.pool[3:]] == [loaded.networks[name] for name in names[-2:]]
     assert evaluate_run(run, Fresh(episodes=2)).num_rows == 2 * 2 * 4 * 2

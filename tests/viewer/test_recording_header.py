@@ -13,6 +13,7 @@ import rerun as rr
 import torch
 from live_viewers import connected, fake, received
 from matrix_games import MatrixGame, chicken, matching_pennies, prisoners_dilemma, stag_hunt
+from random_agents import random_agents
 from recordings import GAME, SCENE, column, headers, names, observing, static, texts
 from rerun.chunk import RrdReader
 from tensordict import TensorDict
@@ -27,7 +28,6 @@ from cprl.institutions import Quota, Tax, Vote
 from cprl.measuring import social
 from cprl.pictures.colours import PALETTE, agent_colour
 from cprl.pictures.readable import rules_of
-from cprl.policies.actors import random_agents
 from cprl.runs.episodes import EpisodeTable
 from cprl.runs.recipe import recipe_table
 from cprl.training import Schedule, train

@@ -15,7 +15,6 @@ harvest and equality of the harvest.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -29,10 +28,10 @@ from cprl.commands.recipe_command import exit_with_message
 from cprl.measuring.playing import evaluate, turns
 from cprl.measuring.registry import COLLECTIVE_RETURN, INCOME, INCOME_EQUALITY
 from cprl.measuring.table import all_metrics, by_replica, complete, where
-from cprl.policies.actors import random_agents
-from cprl.policies.decisions import stored_decisions
+from cprl.policies.actors import LaneActor
 from cprl.policies.joint_policy import JointPolicy
 from cprl.policies.rng import Purpose
+from cprl.population import Scripted
 from cprl.runs.episodes import read_rows, table_of, write_table
 from cprl.studies.trials import Trial
 from cprl.system.output import say
@@ -63,17 +62,18 @@ def play(run: LoadedRun, exploration: float) -> pa.Table:
     worlds = experiment.evaluation_episodes
 
     def agents_at(agent: int) -> list[StoredAgent]:
-        stored = [run.agent(agent, replica=replica) for replica in replicas]
-        return [replace(one, epsilon=exploration) for one in stored]
+        return [run.agent(agent, replica=replica) for replica in replicas]
 
     policy = stored_policies(
-        [agents_at(agent) for agent in range(run.game.agents)],
+        [agents_at(agent) for agent in range(len(run.all_specs))],
         run.playing,
         replicas=replicas,
         worlds=worlds,
         seed=experiment.seed,
-        governor=run.governor(replicas),
     )
+    for actor in policy.actors:
+        if isinstance(actor, LaneActor):
+            actor.epsilon = exploration
     env = make_worlds(experiment, experiment.replicas * worlds, fresh=True)
     if all(ballot.period_episodes == 1 for ballot in run.game.in_force):  # else decisions stay in force
         next(turns(env, _random_policy(run)))
@@ -84,19 +84,16 @@ def _random_policy(run: LoadedRun) -> JointPolicy:
     """Return what plays the first episode of each world of an evaluation, see `evaluate_population`; of it,
     agents see in their first turn what was voted for."""
     experiment = run.experiment
-    count = experiment.replicas
-    worlds = experiment.evaluation_episodes
-    everyone = tuple(range(run.game.agents))
-    decisions = stored_decisions(
-        run.game,
-        {},
-        replicas=range(count),
-        worlds=worlds,
+    agents = [[StoredAgent(spec=Scripted("random"))] * experiment.replicas] * run.game.agents
+    return stored_policies(
+        agents,
+        run.playing,
+        replicas=range(experiment.replicas),
+        worlds=experiment.evaluation_episodes,
         seed=experiment.seed,
         purpose=Purpose.RANDOM_PLAY,
+        decides=Purpose.RANDOM_PLAY,
     )
-    actors = random_agents(run.spaces, everyone, replicas=count, seed=experiment.seed, worlds=worlds)
-    return JointPolicy(actors, decisions=decisions)
 
 
 def rows_of(trial: Trial, table: pa.Table, exploration: float) -> pa.Table:
@@ -128,7 +125,7 @@ def is_the_evaluation(trial: Trial, table: pa.Table) -> bool:
 def explores_as_ever(run: LoadedRun, exploration: float) -> bool:
     """Return whether agents explore so much in the run's own evaluation, or have no exploration."""
     agents = [run.agent(agent, replica=run.replicas[0]) for agent in range(run.game.agents)]
-    return all(one.network is None or one.stochastic or one.epsilon == exploration for one in agents)
+    return all(one.epsilon in (None, exploration) for one in agents)
 
 
 def played(trial: Trial, explorations: Sequence[float]) -> pa.Table:

@@ -62,6 +62,8 @@ class Algorithm(Value, stored=False):
     can_be_recurrent: ClassVar[bool] = False
     """True if the networks can be recurrent. Then the loss must pass on the states of sequences, see
     `cprl.algorithms.base.module_of`."""
+    supports_torchrl: ClassVar[bool] = False
+    """True if the engine "torchrl" can update the agents, see `cprl.learners.plain`."""
 
     update: ClassVar[Update | None] = None
     """How the lanes are updated, see `cprl.learners.networks.Update`. A class declares it for its own loss
@@ -234,15 +236,12 @@ class Algorithm(Value, stored=False):
         Raises:
             ValueError: if the algorithm does not support these agents, or the engine not the algorithm.
         """
-        return Learner(self, lanes, engine)
-
-    def refuse_torchrl(self, engine: TrainingEngine) -> None:
-        """Raise a ValueError if the engine is "torchrl", which supports only independent agents."""
-        if engine == "torchrl":
+        if engine == "torchrl" and not self.supports_torchrl:
             raise ValueError(
                 f'{type(self).__name__} does not support engine="torchrl", which trains independent agents '
                 'one after the other; allowed: engine="compiled" or "eager"'
             )
+        return Learner(self, lanes, engine)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -257,6 +256,7 @@ class OffPolicy(Algorithm, stored=False):
     network: Network | Custom | None = None
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     can_share_parameters: ClassVar[bool] = True
+    supports_torchrl: ClassVar[bool] = True
     sees_peers_actions: ClassVar[bool] = False
     """True if the loss reads the actions of all N agents of the game: "action" is [.., N] in place of [..],
     first the agent's own action, then the others' in the order of their indices. The others may learn by any
@@ -321,6 +321,7 @@ class OnPolicy(Algorithm, stored=False):
     """The architecture of the networks; None for fully connected layers of `settings.hidden_cells`."""
     stochastic: ClassVar[bool] = True
     can_share_parameters: ClassVar[bool] = True
+    supports_torchrl: ClassVar[bool] = True
 
     def make_network(self, spaces: Spaces) -> nn.Module:
         return self.new_networks(spaces, actor=spaces.actions, critic=1)
@@ -368,15 +369,15 @@ class TeamAlgorithm(Algorithm, stored=False):
     """
 
     shares_reward: ClassVar[bool] = True
+    supports_torchrl: ClassVar[bool] = False
     fewest_members: ClassVar[int] = 1
     """The smallest team that the algorithm supports."""
     is_one_lane: ClassVar[bool] = True
     """True if a team is one lane; else each member is a lane of its own."""
 
     def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> Learner:
-        self.refuse_torchrl(engine)
         self.check_team(len(lanes.agents), lanes.reward)
-        return Learner(self, replace(lanes, are_teams=self.is_one_lane), engine)
+        return super().make_learner(replace(lanes, are_teams=self.is_one_lane), engine)
 
     def check_team(self, members: int, reward: Reward) -> None:
         """Raise a ValueError if the algorithm supports no team of this size, or not its reward."""

@@ -7,7 +7,6 @@ from typing import Any
 from cprl.algorithms.base import Algorithm, TrainingEngine
 from cprl.commons.spaces import Spaces
 from cprl.learners.lanes import Lanes
-from cprl.learners.learner import Learner
 from cprl.learners.settings import TabularSettings
 from cprl.learners.tabular import TabularMemory, TabularNetworks, table_network
 from cprl.policies.tabular import TableNetwork
@@ -32,7 +31,3 @@ class Tabular(Algorithm):
         self, networks: Sequence[Any], targets: Any, lanes: Lanes, memory: Any, engine: TrainingEngine
     ) -> Any:
         return TabularNetworks(networks, memory, self.settings)
-
-    def make_learner(self, lanes: Lanes, engine: TrainingEngine = "compiled") -> Learner:
-        self.refuse_torchrl(engine)
-        return super().make_learner(lanes, engine)

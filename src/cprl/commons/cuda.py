@@ -113,8 +113,8 @@ def _without_none(worlds: Worlds) -> Any:
     return worlds._replace(groups=cast(Any, RuleGroups)(*(group or () for group in worlds.groups)))
 
 
-def _no_arrays(arrays: Any, b: int) -> None:
-    """Return None for world b of a group that a game lacks, in place of the function made by `slicer`."""
+def _no_arrays(arrays: Any, index: int) -> None:
+    """Return None for a world, of a group that a game lacks, in place of the function made by `slicer`."""
     return
 
 
@@ -128,7 +128,7 @@ class Kernels(NamedTuple):
 
 @cache
 def kernels(absent: tuple[str, ...]) -> Kernels:
-    """Return the kernels of games that lack these groups; in a kernel, thread b works on world b alone."""
+    """Return the kernels of games that lack these groups; a thread works on the world of its index alone."""
     replacements = {f"one_{name}": _no_arrays for name in absent}
     rules = compiled((*ENTRIES, one_scratch), cuda.jit(device=True), **replacements)
     run_worlds = rules["run_worlds"]
@@ -137,31 +137,31 @@ def kernels(absent: tuple[str, ...]) -> Kernels:
 
     @cuda.jit
     def run(worlds, tables, output, law, actions, decisions, selected, task, scratch):  # type: ignore[no-untyped-def]
-        b = cuda.grid(1)
-        if b < selected.shape[0]:
+        index = cuda.grid(1)
+        if index < selected.shape[0]:
             game = Played(worlds, tables, output, law, actions, decisions, selected)
-            run_worlds(game, task, scratch_of(scratch, b), b, b + 1)
+            run_worlds(game, task, scratch_of(scratch, index), index, index + 1)
 
     @cuda.jit
     def show(worlds, tables, boards, scratch):  # type: ignore[no-untyped-def]
-        b = cuda.grid(1)
-        if b < boards.shape[0]:
-            show_worlds((worlds, tables, boards), scratch_of(scratch, b), b, b + 1)
+        index = cuda.grid(1)
+        if index < boards.shape[0]:
+            show_worlds((worlds, tables, boards), scratch_of(scratch, index), index, index + 1)
 
     return Kernels(run, show, _find_invalid(rules["first_invalid"]))
 
 
 def _find_invalid(first_invalid: Callable[..., int]) -> Any:
-    """Return the kernel that writes the lowest row-major index of an unknown action; its thread b checks
-    world b."""
+    """Return the kernel that writes the lowest row-major index of an unknown action; each thread checks
+    the world of its index."""
 
     @cuda.jit
     def kernel(actions, known, lowest):  # type: ignore[no-untyped-def]
-        b = cuda.grid(1)
-        if b < actions.shape[0]:
-            agent = first_invalid(actions[b], known)
+        index = cuda.grid(1)
+        if index < actions.shape[0]:
+            agent = first_invalid(actions[index], known)
             if agent >= 0:
-                cuda.atomic.min(lowest, 0, b * actions.shape[1] + agent)
+                cuda.atomic.min(lowest, 0, index * actions.shape[1] + agent)
 
     return kernel
 

@@ -17,7 +17,7 @@ from cprl.values.array_types import Bool, Int64, UInt8
 one_world = slicer(Worlds)
 one_output = slicer(StepOutput)
 one_law = slicer(Law)
-one_scratch = slicer(Scratch, every=True)
+one_scratch = slicer(Scratch, all_sliced=True)
 
 
 class Played(NamedTuple):

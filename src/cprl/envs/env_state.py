@@ -21,7 +21,7 @@ def env_state(env: EnvBase) -> dict[str, Any]:
     if commons is None:
         worlds = dict(base_env(env).state_dict())
     else:
-        worlds = {name: _tensor(array) for name, array in commons.worlds.state().items()}
+        worlds = {name: _tensor_of(array) for name, array in commons.worlds.state().items()}
     return {"worlds": worlds, "transforms": _complete_transforms_state(env)}
 
 
@@ -31,9 +31,9 @@ def load_env_state(env: EnvBase, state: Mapping[str, Any]) -> None:
     if commons is None:
         base_env(env).load_state_dict(state["worlds"])
     else:
-        commons.load({name: _array(name, tensor) for name, tensor in state["worlds"].items()})
+        commons.load({name: _array_from(name, tensor) for name, tensor in state["worlds"].items()})
     if isinstance(env, TransformedEnv):
-        _load(env, dict(state["transforms"]))
+        _load_transforms(env, dict(state["transforms"]))
 
 
 _FRAME_BUFFER: Final = "_cat_buffers"
@@ -52,7 +52,7 @@ def load_transforms_state(env: EnvBase, state: Mapping[str, Any]) -> None:
     """Restore a result of `transforms_state` in the transforms of an environment; the observations that they
     keep of its worlds stay."""
     if isinstance(env, TransformedEnv):
-        _load(env, {name: value for name, value in state.items() if _FRAME_BUFFER not in name})
+        _load_transforms(env, {name: value for name, value in state.items() if _FRAME_BUFFER not in name})
 
 
 def _complete_transforms_state(env: EnvBase) -> dict[str, Any]:
@@ -66,7 +66,7 @@ def _complete_transforms_state(env: EnvBase) -> dict[str, Any]:
     }
 
 
-def _load(env: TransformedEnv, state: dict[str, Any]) -> None:
+def _load_transforms(env: TransformedEnv, state: dict[str, Any]) -> None:
     """Load a state into the transforms; observations that they keep of the worlds may be missing in it."""
     transforms = env.transform if isinstance(env.transform, Compose) else [env.transform]
     kinds = ", ".join(type(transform).__name__ for transform in transforms)
@@ -85,8 +85,8 @@ def _load(env: TransformedEnv, state: dict[str, Any]) -> None:
         )
 
 
-def _array(name: str, tensor: Any) -> Any:
-    """Return the array from which `_tensor` made a tensor, by the name that the array has in a state."""
+def _array_from(name: str, tensor: Any) -> Any:
+    """Return the array from which `_tensor_of` made a tensor, by the name that the array has in a state."""
     if name in _UNSIGNED_ARRAYS and isinstance(tensor, Tensor) and tensor.dtype == torch.int64:
         return tensor.numpy(force=True).view(np.uint64)
     return tensor
@@ -96,7 +96,7 @@ _UNSIGNED_ARRAYS: Final = ("seed", "number")
 """The names of the arrays of a state that are uint64."""
 
 
-def _tensor(array: NDArray[Any]) -> Tensor:
+def _tensor_of(array: NDArray[Any]) -> Tensor:
     """Return a tensor of the same bytes; uint64 becomes int64, which all of torch's functions know."""
     signed = array.view(np.int64) if array.dtype == np.uint64 else array
     return torch.from_numpy(signed)

@@ -20,7 +20,7 @@ def heading(subject: str, fresh: Fresh, runs: Iterable[LoadedRun], per_part: str
         end: words at the end of the first line.
     """
     agents = [run.agent(agent, replica=run.replicas[0]) for run in runs for agent in range(run.game.agents)]
-    epsilons = {agent.epsilon for agent in agents if agent.scripted is None and not agent.stochastic}
+    epsilons = {agent.epsilon for agent in agents if agent.epsilon is not None}
     exploration = "".join(f", epsilon {epsilon:g}" for epsilon in sorted(epsilons))
     if fresh.greedy:
         exploration = ", greedy"

@@ -7,7 +7,7 @@ r * episodes to (r + 1) * episodes - 1.
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, Final, TypeAlias
 
@@ -29,7 +29,14 @@ from cprl.system.defaults import Fresh
 from cprl.system.output import legible
 from cprl.system.working import note_progress
 from cprl.training.agents import Population
-from cprl.training.stored import LoadedRun, StoredAgent, consecutive_groups, load, stored_policies
+from cprl.training.stored import (
+    LoadedRun,
+    StoredAgent,
+    consecutive_groups,
+    load,
+    stored_agent,
+    stored_policies,
+)
 from cprl.values import Custom, instantiate, refusal
 
 AgentOfReplica: TypeAlias = Callable[[int], StoredAgent]
@@ -56,7 +63,7 @@ def agents_of(run: LoadedRun, stored_replicas: Mapping[int, int] | None = None) 
 
 def scripted_agent(policy: ScriptedPolicy) -> AgentOfReplica:
     """Return an agent that follows a scripted policy in every replica."""
-    return lambda _: StoredAgent(scripted=policy)
+    return lambda _: StoredAgent(spec=Scripted(policy))
 
 
 def frozen_agent(run: LoadedRun, spec: Frozen) -> AgentOfReplica:
@@ -279,16 +286,15 @@ def agents_specified(
     world_source: WorldSource, specs: Sequence[AgentSpec], fresh: Fresh
 ) -> list[AgentOfReplica]:
     """Return the agents that specifications describe; refuse those that learn, and people."""
-    for agent, spec in enumerate(specs_by_agent(specs, world_source.game.agents)):
+    by_agent = specs_by_agent(specs, world_source.game.agents)
+    for agent, spec in enumerate(by_agent):
         if not isinstance(spec, Scripted | Language | Frozen):
             allowed = "Scripted(policy), Language(model) or Frozen(run, agent, replica)"
             raise ValueError(f"agents[{agent}] is a {type(spec).__name__}; allowed: {allowed}")
-    agents_by_replica: list[dict[int, StoredAgent]] = [{} for _ in range(world_source.game.agents)]
-    for group in consecutive_groups(fresh.replicas):
-        population = Population(world_source.env(len(group)), specs, first_replica=group[0])
-        for by_replica, agents in zip(agents_by_replica, population.as_stored(group), strict=True):
-            by_replica |= zip(group, agents, strict=True)
-    return [by_replica.__getitem__ for by_replica in agents_by_replica]
+    # It refuses agents that cannot play in these worlds.
+    population = Population(world_source.env(), specs, first_replica=fresh.replicas[0])
+    load_once = cache(load)
+    return [partial(stored_agent, spec, calls=population.calls, load=load_once) for spec in by_agent]
 
 
 def agent_named(source: str, agent: int, *, replica: int | None = None, name: str) -> AgentSpec:

@@ -204,10 +204,9 @@ def run_scenarios(
             was trained.
     """
     loaded = as_loaded(run)
-    check_game(loaded.game)
+    chosen = _choose_scenarios(loaded, scenarios)
     count = loaded.game.agents
     check_scripted([(Scripted("greedy"), tuple(range(count)))], loaded.spaces, loaded.game)
-    chosen = _choose_scenarios(loaded, scenarios)
     background_runs = _load_background_runs(loaded, chosen)
     fresh = fresh_for([loaded], fresh, other_runs=background_runs.values())
 

@@ -81,10 +81,8 @@ def engine_of(experiment: "Experiment") -> TrainingEngine:
 
 
 def about_engine(experiment: "Experiment") -> str:
-    """Return a sentence about the engine that "auto" chose, and why; "" if no agent learns."""
+    """Return a sentence about the engine that "auto" chose for agents that learn, and why."""
     updates = planned_updates(experiment)
-    if not updates:
-        return ""
     length = experiment.length
     has_no_clock = length.clock is None and not length.is_of_steps
     if_so_long = f", if each episode has {EPISODE_STEPS} turns," if has_no_clock else ""

@@ -188,9 +188,9 @@ class Experiment(Value, stored=False, called="experiment"):
         return Length.of(vars(self), clock)
 
     @property
-    def specs(self) -> tuple[AgentSpec | GovernorSpec, ...]:
-        """Return the specifications of all agents, and last that of the governor, if it has one."""
-        return self.agents if self.governor is None else (*self.agents, self.governor)
+    def specs(self) -> tuple[AgentSpec | GovernorSpec | None, ...]:
+        """Return the specifications of all agents, and last that of the governor, or None."""
+        return *self.agents, self.governor
 
     @property
     def schedule(self) -> Schedule:
@@ -328,11 +328,11 @@ def _check_governor(experiment: Experiment) -> None:
                 "governor: 0"
             )
         return
-    game = experiment.game
-    if not isinstance(game, Game) or game.governor is None:
+    governor = getattr(experiment.game, "governor", None)
+    if governor is None:
         raise ValueError(f"experiment.governor is {spec}; allowed in a game without a Governor: None")
     if isinstance(spec, Script):
-        spec.check(game.governor)
+        spec.check(governor)
     if isinstance(spec, Learning) and spec != Learning(spec.algorithm):
         raise ValueError(f"experiment.governor is {spec}; allowed for a governor: Learning(algorithm) alone")
     if isinstance(spec, Frozen):

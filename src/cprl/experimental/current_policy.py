@@ -1,8 +1,7 @@
 """CurrentPolicy: the agents of a training in their current state, to play a world beside the training."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import torch
 from tensordict import TensorDictBase
@@ -11,8 +10,7 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from cprl.policies.decisions import Decider
-from cprl.policies.governors import GovernorActor
-from cprl.policies.joint_policy import ActorAgents, JointPolicy
+from cprl.policies.joint_policy import JointPolicy
 from cprl.policies.rng import Purpose
 from cprl.system.compat.tensordicts import unchecked_tensordict
 from cprl.training.agents import Population
@@ -51,38 +49,35 @@ class CurrentPolicy:
     It has its own random numbers, and leaves torch's generators unchanged.
 
     Args:
-        learned: two actors for the agents that learn: one that shares the current weights but has its own
-            random numbers, for one world of each replica; and the actor of the training, whose exploration
-            is copied before each play.
-        others: the actors of the agents that do not learn, for one world of the first replica.
-        decisions: two deciders: one without exploration and with its own random numbers, for one world of the
-            first replica; and that of the training. None in a game without decisions.
-        governor: decides for one world, by its current weights; None without one.
-        replicas: the number of replicas R.
-        device: the device whose generator is left unchanged, besides that of the CPU.
+        population: the agents of the training. Those that learn share their current weights, and their
+            exploration is copied before each play.
     """
 
-    def __init__(
-        self,
-        learned: Mapping[ActorAgents, tuple[Any, Any]],
-        others: Mapping[ActorAgents, nn.Module],
-        *,
-        decisions: tuple[Decider, Decider] | None = None,
-        governor: GovernorActor | None = None,
-        replicas: int,
-        device: torch.device | None = None,
-    ) -> None:
-        self._decisions = decisions
-        current_decisions = None if decisions is None else decisions[0]
-        first = {agents: FirstReplica(current, replicas) for agents, (current, _) in learned.items()}
-        self._policy = JointPolicy({**first, **others}, decisions=current_decisions, governor=governor)
+    def __init__(self, population: Population) -> None:
+        learners = population.learners
+        with torch.random.fork_rng(devices=[]):
+            actors = {agents: learner.evaluation_actor(1) for agents, learner in learners.items()}
+            self._decisions: tuple[Decider, Decider] | None = None
+            if population.decisions is not None:
+                learned = population.decisions
+                alone = learned.without_exploration(Purpose.EXHIBITED_DECISIONS, replicas=1, worlds=1)
+                self._decisions = alone, learned
+            playing = population.other_actors(Purpose.EXHIBITION, worlds=1, replicas=1)
+            for agents, actor in actors.items():
+                playing[agents] = FirstReplica(actor, population.replicas)
+            self._policy = JointPolicy(
+                playing,
+                decisions=None if self._decisions is None else self._decisions[0],
+                governor=population.governor_actor(1),
+            )
         self._pairs = [
-            (current, training)
-            for current, training in learned.values()
-            if hasattr(current, "epsilon") and not getattr(current, "stochastic", False)
+            (actor, learners[agents].actor)
+            for agents, actor in actors.items()
+            if hasattr(actor, "epsilon") and not getattr(actor, "stochastic", False)
         ]
-        self._evaluation = [current.epsilon for current, _ in self._pairs]
-        self._devices = [device] if device is not None and device.type == "cuda" else []
+        self._evaluation = [actor.epsilon for actor, _ in self._pairs]
+        device = population.device
+        self._devices = [device] if device.type == "cuda" else []
         self.is_trained = False
         """True once the training is over; agents then explore as in the evaluation."""
 
@@ -114,25 +109,3 @@ class CurrentPolicy:
         forked = torch.random.fork_rng(devices=self._devices)
         with forked, torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
             yield
-
-
-def current_policy(population: Population) -> CurrentPolicy:
-    """Return the policy of a population's first replica, for one world."""
-    with torch.random.fork_rng(devices=[]):
-        actors: dict[ActorAgents, Any] = {
-            agents: (learner.evaluation_actor(1), learner.actor)
-            for agents, learner in population.learners.items()
-        }
-        decisions = None
-        if population.decisions is not None:
-            learned = population.decisions
-            alone = learned.without_exploration(Purpose.EXHIBITED_DECISIONS, replicas=1, worlds=1)
-            decisions = (alone, learned)
-        return CurrentPolicy(
-            actors,
-            population.other_actors(Purpose.EXHIBITION, worlds=1, replicas=1),
-            decisions=decisions,
-            governor=population.governor_actor(1),
-            replicas=population.replicas,
-            device=population.device,
-        )

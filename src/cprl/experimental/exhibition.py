@@ -22,7 +22,7 @@ from cprl.commons.game import Game
 from cprl.envs.env_state import load_transforms_state, transforms_state
 from cprl.envs.unwrap import commons_of
 from cprl.experiment import Experiment
-from cprl.experimental.current_policy import CurrentPolicy, current_policy
+from cprl.experimental.current_policy import CurrentPolicy
 from cprl.measuring.playing import Policy, turns
 from cprl.measuring.tracker import Episode
 from cprl.training.agents import Population
@@ -235,7 +235,7 @@ def policy_and_world(experiment: Experiment, population: Population) -> tuple[Cu
     """
     with torch.random.fork_rng(devices=[]):
         env = make_worlds(experiment, 1, first=EXHIBITED_WORLD, device=experiment.device)
-        return current_policy(population), env
+        return CurrentPolicy(population), env
 
 
 def caption_of(policy: CurrentPolicy, episode: int) -> str:

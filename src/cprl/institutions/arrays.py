@@ -146,35 +146,35 @@ def state_arrays(arrays: Any, *, derived: bool = False) -> Iterator[tuple[str, A
             yield name, entry, field.role
 
 
-def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
-    """Make a function that takes world b out of a named tuple of arrays, and out of the tuples in it.
+def slicer(kind: Any, *, all_sliced: bool = False) -> Callable[[Any, int], Any]:
+    """Make a function that takes one world out of a named tuple of arrays, and out of the tuples in it.
 
-    The function is called as `one_law(arrays, b)`, and its result shares the memory of the arrays. Entries
-    without the axis of worlds stay as they are. For None it returns None. Its attribute `sliced` says what it
-    does with each entry, see `cprl.system.jit.records.by_reference`.
+    The function is called as `one_law(arrays, b)`, b the index of the world, and its result shares the memory
+    of the arrays. Entries without the axis of worlds stay as they are. For None it returns None. Its
+    attribute `sliced` says what it does with each entry, see `cprl.system.jit.records.by_reference`.
 
     Args:
         kind: the class of the named tuple.
-        every: whether all arrays have the axis of worlds, in front of the axes of their annotations.
+        all_sliced: whether all arrays have the axis of worlds, in front of the axes of their annotations.
     """
     # The function is written out as source, field by field, so that rules can call it: Numba compiles no loop
     # over a tuple whose entries differ in type.
     names: dict[str, Any] = {"__name__": __name__, "kind": kind}
     entries = []
-    parts: list[Any] = []
+    sliced_entries: list[Any] = []
     for name, field in _fields(kind).items():
         entry = f"arrays.{name}"
         inner_kind = _tuple_in(field)
         if inner_kind is not None:
-            inner_function: Any = slicer(inner_kind, every=every)
+            inner_function: Any = slicer(inner_kind, all_sliced=all_sliced)
             names[f"one_{name}"] = inner_function
             entry = f"one_{name}({entry}, b)"
-            parts.append(inner_function.sliced)
-        elif every or (isinstance(field, Field) and field.has_worlds):
+            sliced_entries.append(inner_function.sliced)
+        elif all_sliced or (isinstance(field, Field) and field.has_worlds):
             entry += "[b]"
-            parts.append(True)
+            sliced_entries.append(True)
         else:
-            parts.append(False)
+            sliced_entries.append(False)
         entries.append(entry)
     function_name = f"one_{kind.__name__.lower()}"
     lines = (
@@ -184,7 +184,7 @@ def slicer(kind: Any, *, every: bool = False) -> Callable[[Any, int], Any]:
     )
     exec("\n    ".join(lines), names)
     function: Any = names[function_name]
-    function.sliced = tuple(parts)
+    function.sliced = tuple(sliced_entries)
     return cast(Callable[[Any, int], Any], function)
 
 

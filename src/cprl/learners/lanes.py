@@ -4,7 +4,7 @@ A lane is one agent of one replica, or, if the agents of a replica are a team, t
 updated together, but none influences another.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from math import prod
 from typing import Annotated, Any, TypeAlias
@@ -201,3 +201,25 @@ class Lanes(Value, stored=False):
     def by_network(self, replica_flags: Tensor) -> Tensor:
         """Expand flags of replicas, bool [R], to flags of their networks, bool [L / `sharing`]."""
         return replica_flags.repeat_interleave(len(self) // self.sharing // self.replicas)
+
+
+def outputs_by_agent(team_outputs: Callable[..., Any], members: int) -> Callable[..., Any]:
+    """Return a function of single agents, as actors call it, from a function of teams.
+
+    Args:
+        team_outputs: maps observations [R, k, S, ...] of teams to outputs [R, k, S, A]; recurrent networks
+            also read and return states [R, k, S, K].
+        members: the number of members S.
+
+    Returns:
+        A function that maps [R x S, k, ...] to [R x S, k, A].
+    """
+
+    def agent_outputs(*inputs: Tensor) -> Any:
+        inputs_by_team = (entry.reshape(-1, members, *entry.shape[1:]).transpose(1, 2) for entry in inputs)
+        outputs = team_outputs(*inputs_by_team)
+        if isinstance(outputs, tuple):
+            return tuple(output.transpose(1, 2).flatten(0, 1) for output in outputs)
+        return outputs.transpose(1, 2).flatten(0, 1)
+
+    return agent_outputs

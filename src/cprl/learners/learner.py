@@ -16,8 +16,9 @@ from torch import Tensor, nn
 from cprl import keys
 from cprl.keys import Turn
 from cprl.learners.draw import Draw
-from cprl.learners.lanes import Lanes
+from cprl.learners.lanes import Lanes, outputs_by_agent
 from cprl.learners.networks import LaneNetworks
+from cprl.learners.settings import LearningRateDecay
 from cprl.learners.transitions import LaneTurn, TransitionForm
 from cprl.networks.agent import acting_network
 from cprl.objectives.rewards import RewardModel
@@ -173,7 +174,7 @@ class Learner:
         schedule = getattr(self.settings, "epsilon", None)
         epsilon = 0.0 if schedule is None else schedule(self.steps)  # stochastic policies have no epsilon
         self.actor.explore_with(epsilon)
-        if getattr(self.settings, "learning_rate_end", None) is not None:
+        if isinstance(self.settings, LearningRateDecay):
             self.lane_networks.learning_rate = self.settings.learning_rate_at(self.steps)
         if getattr(self.algorithm, "entropy_coeff_end", None) is not None:
             self.lane_networks.set_entropy_coeff(self.algorithm.entropy_coeff_at(self.steps))
@@ -189,7 +190,7 @@ class Learner:
         """
         lanes = self.lanes
         if lanes.are_teams:
-            outputs = _outputs_by_agent(outputs, len(lanes.agents))
+            outputs = outputs_by_agent(outputs, len(lanes.agents))
         return LaneActor(
             outputs,
             lanes.spaces.actions,
@@ -245,28 +246,6 @@ class Learner:
         self.steps = int(state["steps"])
         self._episodes = state["episodes"].clone()
         self._follow_schedules()
-
-
-def _outputs_by_agent(team_outputs: Callable[..., Any], members: int) -> Callable[..., Any]:
-    """Return a function of single agents, as actors call it, from a function of teams.
-
-    Args:
-        team_outputs: maps observations [R, k, S, ...] of teams to outputs [R, k, S, A]; recurrent networks
-            also read and return states [R, k, S, K].
-        members: the number of members S.
-
-    Returns:
-        A function that maps [R x S, k, ...] to [R x S, k, A].
-    """
-
-    def agent_outputs(*inputs: Tensor) -> Any:
-        inputs_by_team = (entry.reshape(-1, members, *entry.shape[1:]).transpose(1, 2) for entry in inputs)
-        outputs = team_outputs(*inputs_by_team)
-        if isinstance(outputs, tuple):
-            return tuple(output.transpose(1, 2).flatten(0, 1) for output in outputs)
-        return outputs.transpose(1, 2).flatten(0, 1)
-
-    return agent_outputs
 
 
 def new_networks(algorithm: Any, lanes: Lanes, purpose: Purpose) -> list[nn.Module]:

@@ -11,7 +11,7 @@ from torchrl.objectives import LossModule
 
 from cprl.keys import Turn
 from cprl.learners.draw import Draw
-from cprl.learners.lanes import Lanes
+from cprl.learners.lanes import Lanes, outputs_by_agent
 from cprl.learners.optimizers import UpdateRule, clip_by_norm, torch_optimizer
 from cprl.learners.refusals import refuse_other_networks
 from cprl.learners.rollouts import Rollout, advantages
@@ -35,10 +35,10 @@ class Members(nn.ModuleList):
         by_member = observation.unbind(-1 - first.observation_dims)
         return torch.stack([network(entry) for network, entry in zip(self, by_member, strict=True)], -2)
 
-    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Tensor:
+    def outputs(self, observation: Tensor) -> Tensor:
         """Map the observations of lanes, [R x S, k, *shape], to their outputs, [R x S, k, A]."""
-        by_replica = observation.reshape(-1, len(self), *observation.shape[1:]).transpose(1, 2)
-        return self.forward(by_replica).transpose(1, 2).flatten(0, 1)
+        outputs: Tensor = outputs_by_agent(self.forward, len(self))(observation)
+        return outputs
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
         """Return copies of the weights of a lane, as the state dict of its network."""
@@ -88,14 +88,13 @@ class LOLANetworks(nn.Module):
             torch_optimizer(critic_rule, self.critics.parameters(), fused=None),
         ]
 
-    def outputs(self, observation: Tensor, *recurrent: Tensor, part: int = 0) -> Tensor:
-        """Return the outputs of actors, part 0, or critics, part 1, with their current weights, [R x S, k,
-        ...]."""
-        return (self.actors, self.critics)[part].outputs(observation)
+    def outputs(self, observation: Tensor) -> Tensor:
+        """Return the outputs of actors with their current weights, [R x S, k, A]."""
+        return self.actors.outputs(observation)
 
-    def playing(self, *inputs: Tensor) -> Tensor:
-        """Return the outputs by which members act in training."""
-        return self.players.outputs(*inputs)
+    def playing(self, observation: Tensor) -> Tensor:
+        """Return the outputs by which members act in training, [R x S, k, A]."""
+        return self.players.outputs(observation)
 
     def network_state(self, lane: int) -> dict[str, Tensor]:
         """Return copies of the current weights of the actor of a lane."""
@@ -214,7 +213,6 @@ class LOLARollouts:
 
     def write(self, turn: Turn, lane_turn: LaneTurn) -> None:
         """Store a turn; `cprl.learners.learner.Memory.write` says the arguments."""
-        self.rollout.refuse_full()
         self.rollout.write(lane_turn, self._phase)
 
     def due(self, networks: LOLANetworks) -> Iterator[Draw]:

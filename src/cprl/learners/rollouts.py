@@ -187,7 +187,6 @@ class Rollouts:
 
     def write(self, turn: Turn, lane_turn: LaneTurn) -> None:
         """Store a turn; `Memory.write` says the arguments."""
-        self.rollout.refuse_full()
         if self.states is not None and not self.rollout.size:
             self.states.begin(turn)
         self.rollout.write(lane_turn)
@@ -449,17 +448,17 @@ class Rollout:
         """Return whether all turns of the rollout are stored."""
         return self.size == self.steps
 
-    def refuse_full(self) -> None:
-        """Raise a ValueError if there is no room for another turn."""
-        if self.is_full:
-            raise ValueError(f"the rollout already has {self.steps} steps; call update() before store()")
-
     def write(self, turn: LaneTurn, rollout: int | None = None) -> None:
         """Write the next turn.
 
         Args:
             rollout: the index of the rollout if several are kept; None for one.
+
+        Raises:
+            ValueError: if the rollout is full.
         """
+        if self.is_full:
+            raise ValueError(f"the rollout already has {self.steps} steps; call update() before store()")
         for name, field in self.fields.items():
             column = getattr(turn, name)
             if name in ("observation", "next_observation"):

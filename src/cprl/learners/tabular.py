@@ -117,7 +117,7 @@ class TabularNetworks:
         for lane, network in enumerate(networks):
             self.tables.add_lane(lane, network.states.numpy(force=True), network.values.numpy(force=True))
 
-    def outputs(self, observation: Tensor, *, part: int = 0) -> Tensor:
+    def outputs(self, observation: Tensor) -> Tensor:
         """Return the action values of lanes, float64 [L, k, A]."""
         return self.tables.outputs(observation)
 

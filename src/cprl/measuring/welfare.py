@@ -21,18 +21,17 @@ def welfare(game: Game, incomes: Any, steps: Any, stock: Any) -> Float64:
     Args:
         game: a game with a governor.
         incomes: [..., N].
-        steps: the turns T, [...].
+        steps: the turns T, [...], at least 1.
         stock: the apples on the board at the end, [...].
     """
     governor = game.governor
     assert governor is not None
-    played = np.maximum(steps, 1)
     if isinstance(governor.objective, Custom):
         wanted = np.asarray(governor.objective.make(incomes, steps), np.float64)
     elif governor.objective == "lowest_income":
-        wanted = incomes.shape[-1] * incomes.min(-1) / played
+        wanted = incomes.shape[-1] * incomes.min(-1) / steps
     else:
-        wanted = incomes.sum(-1) / played
+        wanted = incomes.sum(-1) / steps
         if governor.objective == "income_times_equality":
             wanted = wanted * np.nan_to_num(equality(incomes))
     return np.where(stock / len(game.map.sites) < governor.least_stock, 0.0, wanted)

@@ -144,17 +144,12 @@ class MADDPGLoss(TDLoss):
             logits = self.outputs_of("actor_network", self.target_actor_network_params, next_entries)
             joint = _for_each_member(sampled_one_hot(logits.softmax(-1), noise))
             value = self._values(next_entries, joint, self.target_critic_network_params)
-            entries = {
-                ("next", keys.reward): reward,
-                ("next", keys.done): _expand_to_reward(next_entries.get(keys.done), reward),
-                ("next", keys.terminated): _expand_to_reward(next_entries.get(keys.terminated), reward),
-            }
-            steps = tensordict.get(keys.steps_to_next_obs, None)
-            if steps is not None:
-                entries[keys.steps_to_next_obs] = _expand_to_reward(steps, reward)
             transitions = TensorDict({}, tensordict.batch_size)
-            for name, entry in entries.items():
-                transitions.set(unravel_key(name), entry)
+            names = [("next", name) for name in (keys.reward, keys.done, keys.terminated)]
+            for name in map(unravel_key, [*names, keys.steps_to_next_obs]):
+                entry = tensordict.get(name, None)
+                if entry is not None:
+                    transitions.set(name, _expand_to_reward(entry, reward))
             target: Tensor = self.value_estimator.value_estimate(transitions, next_value=value)
         return target
 

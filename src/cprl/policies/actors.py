@@ -9,12 +9,11 @@ from typing import Any
 import torch
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
-from torch import Tensor, nn
+from torch import Tensor
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl.commons.spaces import Spaces
 from cprl.keys import recurrent_state
-from cprl.policies.rng import LaneRng, Purpose, lane_seeds
+from cprl.policies.rng import LaneRng
 from cprl.system.compiling import Compiled
 
 
@@ -87,9 +86,8 @@ class LaneActor(ActorOfLanes):
         states = (recurrent_state.AFTER,) if self.state_cells else ()
         self.in_keys = ("observation", *states)
         self.out_keys = ("action", *states)
-        self._epsilon = 0.0 if stochastic else 1.0
         # A tensor, because compiled code treats other numbers as constants.
-        self._epsilon_tensor = torch.tensor(self._epsilon, dtype=torch.float64)
+        self._epsilon = torch.tensor(0.0 if stochastic else 1.0, dtype=torch.float64)
         # Two functions instead of one with *inputs: compiled code that is shared needs named arguments.
         explore = LaneActor._explore_recurrent if self.state_cells else LaneActor._explore
         self._compiled_explore = Compiled(explore, what="agents act", enabled=compile)
@@ -97,7 +95,7 @@ class LaneActor(ActorOfLanes):
     @property
     def epsilon(self) -> float:
         """Return the probability of a random action, 0..1."""
-        return self._epsilon
+        return float(self._epsilon)
 
     @epsilon.setter
     def epsilon(self, epsilon: float) -> None:
@@ -105,9 +103,8 @@ class LaneActor(ActorOfLanes):
 
     def explore_with(self, epsilon: float) -> None:
         """Set `epsilon` if agents have one; faster than setting an attribute of a module."""
-        if epsilon != self._epsilon and not self.stochastic:
-            self._epsilon_tensor.fill_(epsilon)
-            object.__setattr__(self, "_epsilon", float(epsilon))
+        if not self.stochastic:
+            self._epsilon.fill_(epsilon)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         chosen = self.choose_with(*(tensordict.get(name) for name in self.in_keys))
@@ -135,7 +132,7 @@ class LaneActor(ActorOfLanes):
             return [self._by_replica(values.argmax(-1)), *states_after]
         form = tuple((entry.shape, entry.dtype) for entry in inputs)
         numbers = self._draw_numbers(device)
-        return self._compiled_explore(form, self, numbers, self._epsilon_tensor.to(device), *inputs)
+        return self._compiled_explore(form, self, numbers, self._epsilon.to(device), *inputs)
 
     def _explore(self, numbers: Tensor, epsilon: Tensor, observation: Tensor) -> list[Tensor]:
         """Return exploring actions, [R x k, S]."""
@@ -204,15 +201,6 @@ class LaneActor(ActorOfLanes):
         """Reshape [R x k, S, ...] to [L, k, ...]."""
         by_lane = values.view(self.replicas, self.worlds, *values.shape[1:]).transpose(1, 2)
         return by_lane.reshape(-1, *by_lane.shape[2:])
-
-
-def random_agents(
-    spaces: Spaces, agents: tuple[int, ...], *, replicas: int, seed: int, worlds: int = 1
-) -> dict[int | tuple[int, ...], nn.Module]:
-    """Return one uniformly random actor for some agents of every replica, as `JointPolicy` takes actors: by
-    the indices of its agents."""
-    seeds = lane_seeds(seed, replicas=range(replicas), agents=agents, purpose=Purpose.RANDOM_PLAY)
-    return {agents: LaneActor(None, spaces.actions, seeds=seeds, agents=len(agents), worlds=worlds)}
 
 
 class RandomActor(TensorDictModuleBase):

@@ -13,7 +13,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
-from http.client import HTTPException
 from os.path import isabs
 from pathlib import Path
 from threading import Lock
@@ -38,12 +37,6 @@ _FIELDS: Final = (
 """What is kept of a call."""
 _MOST_BYTES: Final = 2**20
 """The longest answer that is read."""
-_USAGE: Final = ("prompt_tokens", "completion_tokens")
-_BROKEN: Final = (
-    *(HTTPException, ValueError, LookupError, TypeError, AttributeError),
-    *(ArithmeticError, RecursionError),
-)
-"""What reading half an answer, or one of another form, raises."""
 _BUSY: Final = (408, 429)
 """The statuses below 500 after which a call is tried again."""
 
@@ -93,9 +86,9 @@ class Question(NamedTuple):
     system: str
     prompt: str
 
-    def request(self, model: Model) -> dict[str, Any]:
-        """Return the body of the request."""
-        return {
+    def new_call(self, model: Model) -> dict[str, Any]:
+        """Return what is kept of a call before it is made: the hash of its request, its name, its request."""
+        request = {
             "model": model.model,
             "messages": [
                 {"role": "system", "content": self.system},
@@ -106,6 +99,7 @@ class Question(NamedTuple):
             "seed": self.seed,
             "response_format": {"type": "json_object"},
         }
+        return {"hash": _hash(request), "call": self.call, "request": request}
 
 
 class Calls:
@@ -139,22 +133,21 @@ class Calls:
             ValueError: if `Model.stored` lacks a call.
             ConnectionError: if the first call of all fails in a way that a retry cannot change.
         """
-        hashes = [_hash(question.request(model)) for question in questions]
-        by_hash = dict(zip(hashes, questions, strict=True))
-        new = [by_hash[name] for name in by_hash if name not in self.kept]
+        calls = [question.new_call(model) for question in questions]
+        new = {call["hash"]: call for call in calls if call["hash"] not in self.kept}
         self._most = model.max_calls
-        if new and model.stored is not None:
-            self._take(model, new)
-        elif new:
-            left = model.max_calls - sum(call["tries"] > 0 for call in self.kept.values())
+        if model.stored is not None:
+            for call in new.values():
+                self._keep(self._stored_call(model.stored, call))
+        else:
+            left = model.max_calls - self._made
             most_tries = [1 + model.retries if index < left else 0 for index in range(len(new))]
             with ThreadPoolExecutor(model.concurrency) as pool:
-                list(pool.map(partial(self._make, model, read), new, most_tries))
-        return [_understood(self.kept[name]["answer"], read)[0] for name in hashes]
+                list(pool.map(partial(self._make, model, read), new.values(), most_tries))
+        return [_understood(self.kept[call["hash"]]["answer"], read)[0] for call in calls]
 
-    def _make(self, model: Model, read: Callable[[Any], Any], question: Question, most_tries: int) -> None:
+    def _make(self, model: Model, read: Callable[[Any], Any], call: dict[str, Any], most_tries: int) -> None:
         """Make a call, and keep what came of it."""
-        request = question.request(model)
         began = time.monotonic()
         tries = 0
         outcome = _Outcome(None, OVER_LIMIT)
@@ -162,7 +155,7 @@ class Calls:
             if tries:
                 time.sleep(model.backoff_s * 2 ** (tries - 1))
             tries += 1
-            outcome = _post(model, request)
+            outcome = _post(model, call["request"])
             if not outcome.may_retry:
                 break
         # a list, since other threads keep calls meanwhile
@@ -171,9 +164,7 @@ class Calls:
         prompt_price, answer_price = model.prices or (0.0, 0.0)
         self._keep(
             {
-                "hash": _hash(request),
-                "call": question.call,
-                "request": request,
+                **call,
                 "answer": outcome.answer,
                 "failure": outcome.failure or _understood(outcome.answer, read)[1],
                 "tries": tries,
@@ -185,20 +176,15 @@ class Calls:
             }
         )
 
-    def _take(self, model: Model, questions: Sequence[Question]) -> None:
-        """Take calls from another run; refuse those that it does not keep."""
-        path = Path(str(model.stored)) / CALLS
+    def _stored_call(self, run: str, call: dict[str, Any]) -> dict[str, Any]:
+        """Return a call as another run keeps it; refuse one that it does not keep."""
+        path = Path(run) / CALLS
         if path not in self._stored:
             self._stored[path] = read_calls(path)
         stored = self._stored[path]
-        for question in questions:
-            request = question.request(model)
-            name = _hash(request)
-            if name not in stored:
-                raise ValueError(
-                    f"{path} keeps no answer for {question.call}: {_differs(stored, question.call, request)}"
-                )
-            self._keep(stored[name])
+        if call["hash"] not in stored:
+            raise ValueError(f"{path} keeps no answer for {call['call']}: {_differs(stored, call)}")
+        return stored[call["hash"]]
 
     def _keep(self, call: dict[str, Any]) -> None:
         with self._lock:
@@ -210,20 +196,26 @@ class Calls:
 
     def in_words(self) -> str:
         """Return how many calls were made, their tokens, failures and costs; "" without any."""
-        calls = self.kept.values()
-        if not calls:
+        if not self.kept:
             return ""
-        made = sum(call["tries"] > 0 for call in calls)
-        tokens = sum(call["prompt_tokens"] for call in calls)
-        answered = sum(call["answer_tokens"] for call in calls)
-        failed = sum(call["failure"] is not None for call in calls)
-        words = f"{made:,} calls, {tokens:,} + {answered:,} tokens, {failed:,} without a usable answer"
-        dollars = sum(call["dollars"] for call in calls)
+        tokens = f"{self._total('prompt_tokens'):,} + {self._total('answer_tokens'):,} tokens"
+        failed = sum(call["failure"] is not None for call in self.kept.values())
+        words = f"{self._made:,} calls, {tokens}, {failed:,} without a usable answer"
+        dollars = self._total("dollars")
         if dollars:
             words += f", {dollars:,.4f} US dollars"
         if dollars and self._most:
-            words += f" ({self._most:,} such calls: {dollars / made * self._most:,.2f})"
+            words += f" ({self._most:,} such calls: {dollars / self._made * self._most:,.2f})"
         return words
+
+    @property
+    def _made(self) -> int:
+        """Return how many of the calls were made."""
+        return sum(call["tries"] > 0 for call in self.kept.values())
+
+    def _total(self, name: str) -> Any:
+        """Return the sum of a number of all calls."""
+        return sum(call[name] for call in self.kept.values())
 
 
 class _Outcome(NamedTuple):
@@ -268,7 +260,8 @@ def _post(model: Model, request: dict[str, Any]) -> _Outcome:
         table = json.loads(_body(message, model.timeout_s))
         answer = table["choices"][0]["message"]["content"]
         usage = table.get("usage") or {}
-        prompt_tokens, answer_tokens = (int(usage.get(name) or 0) for name in _USAGE)
+        prompt_tokens = int(usage.get("prompt_tokens") or 0)
+        answer_tokens = int(usage.get("completion_tokens") or 0)
     except HTTPError as error:
         is_busy = error.code in _BUSY or error.code >= 500
         return _Outcome(None, f"status {error.code}", may_retry=is_busy, is_refused=not is_busy)
@@ -277,7 +270,7 @@ def _post(model: Model, request: dict[str, Any]) -> _Outcome:
         if isinstance(reason, TimeoutError):
             return _Outcome(None, "no answer in time", may_retry=True)
         return _Outcome(None, f"no connection: {reason}", may_retry=True, is_refused=True)
-    except _BROKEN as error:
+    except Exception as error:  # half an answer, or one of any other form
         return _Outcome(None, f"a broken answer: {type(error).__name__}", may_retry=True)
     failure = None if isinstance(answer, str) else "an answer without text"
     return _Outcome(None if failure else answer, failure, prompt_tokens, answer_tokens)
@@ -311,10 +304,11 @@ def _understood(answer: str | None, read: Callable[[Any], T]) -> tuple[T | None,
         return None, str(error)
 
 
-def _differs(stored: dict[str, dict[str, Any]], name: str, request: dict[str, Any]) -> str:
-    """Return what differs between a request and the stored one of the same name."""
-    for call in stored.values():
-        if call["call"] == name:
-            changed = [part for part in request if request[part] != call["request"].get(part)]
+def _differs(stored: dict[str, dict[str, Any]], call: dict[str, Any]) -> str:
+    """Return what differs between a call and the stored one of the same name."""
+    request = call["request"]
+    for earlier in stored.values():
+        if earlier["call"] == call["call"]:
+            changed = [part for part in request if request[part] != earlier["request"].get(part)]
             return f"it keeps one with another {' and '.join(changed)}"
     return "it keeps none of that name"

@@ -15,7 +15,6 @@ import torch
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from cprl.commons.game import Game
 from cprl.policies.rng import Purpose, lane_names, lane_seeds
 from cprl.values import Positive, Range, Share, Value
 from cprl.values.array_types import Bool, Float64, Int64
@@ -24,9 +23,9 @@ UNTRIED = -np.inf
 """The value of a choice that an agent has never made."""
 
 
-def ballot_sizes(game: Game) -> tuple[int, ...]:
-    """Return the number of choices of each ballot of a game."""
-    return tuple(len(ballot.choices) for ballot in game.ballots)
+def ballot_sizes(game: Any) -> tuple[int, ...]:
+    """Return the number of choices of each ballot of a game; () for one without ballots, of whatever kind."""
+    return tuple(len(ballot.choices) for ballot in getattr(game, "ballots", ()))
 
 
 def choices_of(decision: Int64, sizes: Sequence[int]) -> Int64:
@@ -59,11 +58,12 @@ class Decider(nn.Module):
         seeds: the seed of each lane, lane = replica x N + agent.
         agents: the number of agents N.
         worlds: the number of worlds k of each replica, consecutive in the batch.
-        values: float64 [R, N, C], the values of the C choices of all ballots, ballot after ballot; `UNTRIED`
-            for a choice that was never made. Not copied, so that the decider follows what is learned. None
-            for agents that all choose at random.
-        epsilon: float64 [R, N], 0..1, not copied either; None for 0.
-        by_chance: bool [N], marks agents that always choose at random; None for no agent.
+        stored: the values that agents learned, float64 [C] for each replica, by agent: those of the C choices
+            of all ballots, ballot after ballot; `UNTRIED` for a choice that was never made. Agents that are
+            not in it always choose at random.
+
+    `values`, float64 [R, N, C], and `by_chance`, bool [N], say so of all agents.
+    `epsilon`, float64 [R, N], initially 0, is the probability of a random choice of each agent.
     """
 
     def __init__(
@@ -73,22 +73,19 @@ class Decider(nn.Module):
         seeds: Sequence[Sequence[int]],
         agents: int,
         worlds: int = 1,
-        values: Float64 | None = None,
-        epsilon: Float64 | None = None,
-        by_chance: Sequence[bool] | None = None,
+        stored: Mapping[int, Sequence[Tensor]],
     ) -> None:
         super().__init__()
         self.sizes = tuple(sizes)
         self.agents = agents
         self.worlds = worlds
         self.replicas = len(seeds) // agents
-        self._seeds = [tuple(seed) for seed in seeds]
-        size = self.replicas, self.agents
-        self.values = np.zeros((*size, sum(self.sizes))) if values is None else values
-        self.epsilon = np.zeros(size) if epsilon is None else epsilon
-        self.by_chance = np.full(self.agents, values is None)
-        if by_chance is not None:
-            self.by_chance |= np.array(by_chance, np.bool_)
+        self._seeds = seeds
+        self.values = np.full((self.replicas, agents, sum(self.sizes)), UNTRIED)
+        for agent, values in stored.items():
+            self.values[:, agent] = torch.stack(list(values)).numpy(force=True)
+        self.by_chance = np.array([agent not in stored for agent in range(agents)])
+        self.epsilon = np.zeros((self.replicas, agents))
         batch = self.replicas * self.worlds
         self._choices = np.zeros((batch, self.agents, len(self.sizes)), np.int64)
         """The latest choice of each agent of each world on each ballot, [R x k, N, V]."""
@@ -208,8 +205,8 @@ class BanditDecider(Decider):
     Args:
         sizes: see `Decider`, also for `worlds`.
         bandits: by agent; None for agents that do not learn to vote.
-        stored: the values that agents learned in an earlier run, float64 [C] for each replica, by agent.
-            Agents with neither such values nor a bandit choose at random.
+        stored: the values of agents of earlier runs, see `Decider`. Agents with neither such values nor a
+            bandit choose at random.
         replicas: the number of replicas R.
         seed: the seed of the run.
         first_replica: the index of the first replica.
@@ -232,15 +229,8 @@ class BanditDecider(Decider):
         seeds = lane_seeds(
             seed, replicas=self._replica_indices, agents=range(agents), purpose=Purpose.DECISIONS
         )
-        super().__init__(
-            sizes,
-            seeds=seeds,
-            agents=agents,
-            worlds=worlds,
-            values=_new_values(sizes, stored, replicas=replicas, agents=agents),
-            epsilon=np.zeros((replicas, agents)),
-            by_chance=[bandit is None and agent not in stored for agent, bandit in enumerate(bandits)],
-        )
+        super().__init__(sizes, seeds=seeds, agents=agents, worlds=worlds, stored=stored)
+        self.by_chance &= np.array([bandit is None for bandit in bandits])
         self.bandits = tuple(bandits)
         self.times = np.zeros(self.values.shape, np.int64)
         """int64 [R, N, C], the number of episodes from which each choice was learned."""
@@ -272,7 +262,7 @@ class BanditDecider(Decider):
                 self.epsilon[:, agent] = [bandit.epsilon(episode) for episode in self.episodes.tolist()]
 
     def without_exploration(self, purpose: Purpose, *, replicas: int, worlds: int) -> Decider:
-        """Return a decider of the same agents that does not explore.
+        """Return a decider of the same agents that does not explore, and follows what they learn.
 
         Args:
             purpose: the purpose of its random numbers.
@@ -280,14 +270,11 @@ class BanditDecider(Decider):
             worlds: the number of worlds of each replica.
         """
         indices = self._replica_indices[:replicas]
-        return Decider(
-            self.sizes,
-            seeds=lane_seeds(self._seed, replicas=indices, agents=range(self.agents), purpose=purpose),
-            agents=self.agents,
-            worlds=worlds,
-            values=self.values[:replicas],
-            by_chance=self.by_chance.tolist(),
-        )
+        seeds = lane_seeds(self._seed, replicas=indices, agents=range(self.agents), purpose=purpose)
+        decider = Decider(self.sizes, seeds=seeds, agents=self.agents, worlds=worlds, stored={})
+        decider.values = self.values[:replicas]
+        decider.by_chance = self.by_chance
+        return decider
 
     def learned(self) -> dict[str, Tensor]:
         """Return copies of the values of the agents that learn, float64 [C], by "replica_0/agent_0" and so
@@ -307,44 +294,3 @@ class BanditDecider(Decider):
         for name in ("values", "times", "episodes"):
             getattr(self, name)[:] = state[name].numpy(force=True)
         self._update_epsilon()
-
-
-def stored_decisions(
-    game: Game,
-    stored: Mapping[int, Sequence[Tensor]],
-    *,
-    replicas: Sequence[int],
-    worlds: int,
-    seed: int,
-    purpose: Purpose,
-) -> Decider | None:
-    """Return a decider of agents that vote by the values of earlier runs and do not explore.
-
-    Return None for a game without ballots.
-
-    Args:
-        stored: the values of earlier runs, see `BanditDecider`; agents without values choose at random.
-        replicas: the indices of the replicas that play.
-        purpose: the purpose of the random numbers.
-    """
-    sizes = ballot_sizes(game)
-    if not sizes:
-        return None
-    return Decider(
-        sizes,
-        seeds=lane_seeds(seed, replicas=replicas, agents=range(game.agents), purpose=purpose),
-        agents=game.agents,
-        worlds=worlds,
-        values=_new_values(sizes, stored, replicas=len(replicas), agents=game.agents),
-        by_chance=[agent not in stored for agent in range(game.agents)],
-    )
-
-
-def _new_values(
-    sizes: Sequence[int], stored: Mapping[int, Sequence[Tensor]], *, replicas: int, agents: int
-) -> Float64:
-    """Return the values of all choices, float64 [R, N, C]: stored ones, and `UNTRIED` for other agents."""
-    values = np.full((replicas, agents, sum(sizes)), UNTRIED)
-    for agent, by_replica in stored.items():
-        values[:, agent] = torch.stack(list(by_replica)).numpy(force=True)
-    return values

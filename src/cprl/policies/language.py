@@ -10,7 +10,7 @@ of the other agents of the world read in later turns.
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 
 import numpy as np
 import torch
@@ -31,13 +31,13 @@ from cprl.policies.scripted import (
     BEHAVIOURS,
     SCRIPTED_POLICIES,
     SPARE,
+    Plan,
     ScriptedActor,
     ScriptedPolicy,
     can_tag,
-    plan_numbers,
     scripted_lanes,
 )
-from cprl.values import Natural, Positive, Range, Value, build, checked
+from cprl.values import Natural, Positive, Range, Value, build, checked, refusal
 from cprl.values.array_types import AnyArray, Float32, Int64
 
 _TURN, _NEXT, _HARVEST, _PLAN = range(4)
@@ -59,18 +59,22 @@ class Language(Model):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Plan(Value, stored=False):
-    """What an agent does until the next plan."""
+class _Answer(Value, stored=False):
+    """What a model may say beside what its agent does."""
 
-    policy: ScriptedPolicy
-    spare: Annotated[int, Range(1, 8)] = SPARE
-    """The apples that "sustainable" leaves near each that it takes."""
-    region: tuple[Natural, Natural] | None = None
-    """The rows ahead and the columns to each side in which it harvests, see `ScriptedActor`."""
-    tag: tuple[Natural, ...] | None = None
-    """The agents at whom it fires, see `ScriptedActor`."""
+    why: str = ""
+    message: Text = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _PlanAnswer(Plan, _Answer, stored=False):
     signal: Natural = 0
-    """The signal that it sends in each turn, see `Rules.signals`; 0 for none."""
+    """The signal that the agent sends in each turn, see `Rules.signals`; 0 for none."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ActionAnswer(_Answer, stored=False):
+    action: Natural
 
 
 def _form(entries: dict[str, Any], *, talks: bool) -> str:
@@ -89,7 +93,7 @@ def _form(entries: dict[str, Any], *, talks: bool) -> str:
 
 
 class _BoardPlans:
-    """Plans on a board: the numbers of a scripted policy, see `plan_numbers`, and last a signal.
+    """Plans on a board: the numbers of a `Plan`, and last a signal.
 
     Args:
         game: the game that is played.
@@ -100,7 +104,7 @@ class _BoardPlans:
         self.game = game
         self.talks = game.rules.signals > 0
         """Whether agents send each other messages."""
-        self.fallback = (*plan_numbers(game, script.policy), 0)
+        self.fallback = (*Plan(script.policy).numbers(game), 0)
         """The numbers of the plan of an agent without an answer."""
         self._widest = self.fallback[2:4]
         """The region of an agent that harvests wherever it sees."""
@@ -156,7 +160,7 @@ class _BoardPlans:
         game = self.game
         lines = []
         for number in range(1, game.rules.signals + 1):
-            senders = np.count_nonzero(observation[game.channels.index(f"signal {number}")])
+            senders = np.count_nonzero(self._entries(observation, f"signal {number}"))
             lines += [f"Signal {number} was sent by {senders} of those you see."] * bool(senders)
         if game.observation.scoreboard:
             bytes_ = self._entries(observation, "scoreboard")[: game.agents].astype(np.int64)
@@ -176,22 +180,17 @@ class _BoardPlans:
         """Return the numbers that the channels of a name show."""
         return observation[np.array(self.game.channels) == channel].reshape(-1)
 
-    def read(self, table: Any) -> tuple[int, ...]:
-        """Return the numbers of a plan; raise a ValueError if it is not allowed."""
-        plan = build(Plan, table, "answer")
-        checked("answer.signal", plan.signal, Annotated[int, Range(0, self.game.rules.signals)])
-        return *plan_numbers(self.game, plan.policy, plan.spare, plan.region, plan.tag), plan.signal
+    def read(self, table: Any) -> tuple[_Answer, tuple[int, ...]]:
+        """Return an answer, and its plan as numbers; raise a ValueError if it is not allowed."""
+        answer = build(_PlanAnswer, table, "answer")
+        checked("answer.signal", answer.signal, Annotated[int, Range(0, self.game.rules.signals)])
+        return answer, (*answer.numbers(self.game), answer.signal)
 
     def act(self, plans: Int64, tensordict: TensorDictBase) -> Int64:
         """Return actions, int64 [B, S], by plans, [B, S, 5 + N]."""
         seen = map(tensordict.get, self._script.in_keys)
         silent = self._script.choose(*seen, plans=plans[..., :-1]).numpy(force=True)
         return silent + plans[..., -1] * self.game.tables.silent_actions
-
-
-@dataclass(frozen=True, kw_only=True)
-class _Action(Value, stored=False):
-    action: Natural
 
 
 class _PlainActions:
@@ -216,9 +215,10 @@ class _PlainActions:
         numbers = " ".join(f"{number:g}" for number in observation.reshape(-1).tolist())
         return f"Turn {turn + 1}.{last} You observe: {numbers}"
 
-    def read(self, table: Any) -> tuple[int, ...]:
-        action = build(_Action, table, "answer").action
-        return (checked("answer.action", action, Annotated[int, Range(0, self._actions - 1)]),)
+    def read(self, table: Any) -> tuple[_Answer, tuple[int, ...]]:
+        answer = build(_ActionAnswer, table, "answer")
+        checked("answer.action", answer.action, Annotated[int, Range(0, self._actions - 1)])
+        return answer, (answer.action,)
 
     def act(self, plans: Int64, tensordict: TensorDictBase) -> Int64:
         at_random = self._script.choose(tensordict.get("observation")).numpy(force=True)
@@ -262,16 +262,15 @@ class LanguageActor(TensorDictModuleBase):
         self.replicas = len(seeds) // agents
         size: dict[str, Any] = {"seeds": seeds, "agents": agents, "worlds": worlds}
         if isinstance(playing, Game):
-            self.script: Any = ScriptedActor(spec.fallback, playing, **size)
+            self.script: Any = ScriptedActor(Plan(spec.fallback), playing, **size)
             self._answers: Any = _BoardPlans(playing, self.script)
         else:
             self.script = scripted_lanes(spec.fallback, playing, **size)
             self._answers = _PlainActions(playing, self.script)
         self._system = "\n".join(filter(None, (spec.instructions, self._answers.rules(spec))))
         self._calls = calls
-        self._seeds = [tuple(seed) for seed in seeds]
-        self._numbers = [seed[2] for seed in self._seeds[:agents]]
-        """The indices of the S agents in the game."""
+        self._seeds = seeds
+        """Of each lane: the seed of the run, the replica, the agent, and the purpose, see `lane_seeds`."""
         self._said = {} if said is None else said
         self._asked = np.zeros((len(seeds), worlds), np.int64)
         """How often each lane has asked in each world."""
@@ -282,7 +281,7 @@ class LanguageActor(TensorDictModuleBase):
         observation = tensordict.get("observation")
         memory = tensordict.get(recurrent_state.AFTER).numpy(force=True).copy()
         for world, index in np.argwhere(memory[..., _TURN] == 0).tolist():
-            self._said[world, self._numbers[index]] = []
+            self._said[world, self._seeds[index][2]] = []
         due = (memory[..., _NEXT] <= memory[..., _TURN]) & ~tensordict.get(keys.DONE).numpy(force=True)
         if isinstance(self._answers, _BoardPlans):
             memory[..., _HARVEST] += tensordict.get(keys.HARVEST[1]).numpy(force=True)
@@ -306,14 +305,14 @@ class LanguageActor(TensorDictModuleBase):
             plan, message = answer or (self._answers.fallback, "")
             memory[world, index, _PLAN:] = plan
             if message:
-                self._said[world, self._numbers[index]].append((int(memory[world, index, _TURN]), message))
+                self._said[world, self._seeds[index][2]].append((int(memory[world, index, _TURN]), message))
 
-    def _read(self, table: dict[str, Any]) -> tuple[tuple[int, ...], str]:
+    def _read(self, table: Any) -> tuple[tuple[int, ...], str]:
         """Return the numbers of a plan, and a message; raise a ValueError if they are not allowed."""
-        plan = dict(table)
-        checked("why", plan.pop("why", ""), str)
-        message = checked("message", plan.pop("message", ""), Text if self._answers.talks else Literal[""])
-        return self._answers.read(plan), message
+        answer, plan = self._answers.read(table)
+        if answer.message and not self._answers.talks:
+            raise refusal("answer.message", answer.message, "none, in a game without talk")
+        return plan, answer.message
 
     def _heard(self, world: int, listener: int, turn: float) -> list[str]:
         """Return the last message of each other agent before a turn, a line each; [] in a game without

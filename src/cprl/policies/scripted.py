@@ -24,7 +24,7 @@ the harvest and how long it lasts ("greedy", "sustainable"), and peace ("territo
 """
 
 from collections.abc import Mapping, Sequence
-from functools import cache
+from dataclasses import dataclass
 from typing import Annotated, Any, Final, Literal, get_args
 
 import numpy as np
@@ -45,7 +45,6 @@ from cprl.policies.actors import ActorOfLanes, LaneActor
 from cprl.policies.scripted_rules import (
     AGENT,
     APPLE,
-    FOE,
     NUMBERS,
     OPEN,
     UNKNOWN,
@@ -55,7 +54,7 @@ from cprl.policies.scripted_rules import (
     Settings,
 )
 from cprl.system.jit.compiled import compiled_for_cpu
-from cprl.values import Range, checked
+from cprl.values import Natural, Range, Value, checked
 from cprl.values.array_types import Int64, UInt8
 
 ScriptedPolicy = Literal["random", "greedy", "sustainable", "territorial", "aggressive", "pacifist"]
@@ -95,42 +94,42 @@ apples and 3 x 0.01 with 2."""
 _FIRE: Final = ("territorial", "aggressive")
 
 
-def plan_numbers(
-    game: Game,
-    policy: ScriptedPolicy,
-    spare: int = SPARE,
-    region: Sequence[int] | None = None,
-    tag: Sequence[int] | None = None,
-) -> tuple[int, ...]:
-    """Return how an agent follows a policy, as 4 + N numbers: the index of the policy, `spare`, the rows and
-    columns of `region`, and for each agent of the game 1 if it is fired at.
+@dataclass(frozen=True)
+class Plan(Value, stored=False):
+    """How agents follow a scripted policy.
 
     Args:
-        game: the game that is played.
-        spare: see `ScriptedActor`, as are `region` and `tag`.
-
-    Raises:
-        ValueError: if the region is larger than the window; if `tag` names an agent that is not in the game,
-            or any in a game whose windows show all other agents alike, or without a beam.
+        policy: the scripted policy.
+        spare: for "sustainable": the number of other apples near an apple that it harvests.
+        region: the rows ahead, and the columns to each side, of its window, in which it harvests; None for
+            all. Elsewhere it goes around apples.
+        tag: the agents at whom it fires, in place of those at whom the policy fires; None for these.
     """
-    rules = game.rules
-    rows = rules.window_rows - 1
-    columns = rules.window_columns // 2
-    if region is not None:
+
+    policy: ScriptedPolicy
+    spare: Annotated[int, Range(1, 8)] = SPARE
+    region: tuple[Natural, Natural] | None = None
+    tag: tuple[Natural, ...] | None = None
+
+    def numbers(self, game: Game) -> tuple[int, ...]:
+        """Return the plan in a game as 4 + N numbers: the index of the policy, `spare`, the rows and columns
+        of `region`, and for each agent of the game 1 if it is fired at.
+
+        Raises:
+            ValueError: if the region is larger than the window; if `tag` names an agent that is not in the
+                game, or any in a game whose windows show all other agents alike, or without a beam.
+        """
+        rows = game.rules.window_rows - 1
+        columns = game.rules.window_columns // 2
         limits = tuple[Annotated[int, Range(0, rows)], Annotated[int, Range(0, columns)]]
-        rows, columns = checked("region", tuple(region), limits)
-    foes: Sequence[int] = range(game.agents) if policy in _FIRE else ()
-    if tag is not None:
-        foes = checked("tag", tuple(tag), tuple[Annotated[int, Range(0, game.agents - 1)], ...])
-        if foes and not can_tag(game):
-            raise ValueError(f"tag is {foes}; allowed without a beam and Observation.agents_apart: ()")
-    return (
-        SCRIPTED_POLICIES.index(policy),
-        spare,
-        rows,
-        columns,
-        *(agent in foes for agent in range(game.agents)),
-    )
+        region = checked("region", self.region or (rows, columns), limits)
+        foes: Sequence[int] = range(game.agents) if self.policy in _FIRE else ()
+        if self.tag is not None:
+            foes = checked("tag", self.tag, tuple[Annotated[int, Range(0, game.agents - 1)], ...])
+            if foes and not can_tag(game):
+                raise ValueError(f"tag is {foes}; allowed without a beam and Observation.agents_apart: ()")
+        are_foes = (agent in foes for agent in range(game.agents))
+        return SCRIPTED_POLICIES.index(self.policy), self.spare, *region, *are_foes
 
 
 def can_tag(game: Game) -> bool:
@@ -145,15 +144,11 @@ class ScriptedActor(ActorOfLanes):
     seconds; the compiled code is cached on disk.
 
     Args:
-        policy: the scripted policy.
+        plan: the scripted policy, and how the agents follow it.
         game: the game that the agents play.
         seeds: the seed of each lane, lane = replica x S + agent.
         agents: the number of agents S of each replica.
         worlds: the number of worlds k of each replica, consecutive in the batch.
-        spare: for "sustainable": the number of other apples near an apple that it harvests, at least 1.
-        region: the rows ahead, and the columns to each side, of its window, in which it harvests; None for
-            all. Elsewhere it goes around apples.
-        tag: the agents at whom it fires, in place of those at whom the policy fires; None for these.
 
     `epsilon`, initially 0, is the probability of a random action under `ExplorationType.RANDOM`; under other
     exploration types it has no effect.
@@ -161,15 +156,12 @@ class ScriptedActor(ActorOfLanes):
 
     def __init__(
         self,
-        policy: ScriptedPolicy,
+        plan: Plan,
         game: Game,
         *,
         seeds: Sequence[Sequence[int]],
         agents: int,
         worlds: int = 1,
-        spare: int = SPARE,
-        region: Sequence[int] | None = None,
-        tag: Sequence[int] | None = None,
     ) -> None:
         super().__init__(seeds, agents, worlds, NUMBERS)
         if game.observation.area != "window":
@@ -182,12 +174,12 @@ class ScriptedActor(ActorOfLanes):
                 "Rules.harvest_action is True; allowed with scripted policies but 'random': False, because "
                 "no window shows what is under an agent"
             )
-        self.policy = policy
+        self.policy = plan.policy
         self.game = game
         self.epsilon = 0.0
         if paints_over(game.rules.quirks):
             self.in_keys = ("observation", keys.APPLE_AHEAD[1])
-        self._plan = plan_numbers(game, policy, spare, region, tag)
+        self._plan = np.array(plan.numbers(game))
         self._settings = _settings(game)
         self._rim, self._frame = _frame(game)
         size = self._frame.stride * (game.rules.window_rows + 2 * self._rim)
@@ -204,41 +196,27 @@ class ScriptedActor(ActorOfLanes):
         Args:
             observation: uint8 [replicas x k, S, C, X, Y].
             apple_ahead: `cprl.keys.APPLE_AHEAD`, bool [replicas x k, S, 1], under `Quirks2019.paint_over`.
-            plans: the numbers of `plan_numbers` by which each agent chooses instead, int64
+            plans: the numbers of `Plan.numbers` by which each agent chooses instead, int64
                 [replicas x k, S, 4 + N].
         """
         explores = exploration_type() in (ExplorationType.RANDOM, None)
         epsilon = float(self.epsilon) if explores else 0.0
         framed = self._framed(observation, apple_ahead)
-        numbers = self._numbers()
         chosen = np.empty(len(framed), np.int64)
-        for lanes, (policy, spare, rows, columns, *foes) in self._by_plan(plans):
-            settings = self._settings._replace(
-                fires=self.game.rules.may_fire and any(foes),
-                spare=spare,
-                region_rows=rows,
-                region_columns=columns,
-            )
-            actions = chosen[lanes]
-            compiled_for_cpu(scripted_rules.choose_all, inline=False)(
-                policy,
-                epsilon,
-                np.take(_roles(tuple(foes)), framed[lanes]),
-                self._frame,
-                numbers[lanes],
-                settings,
-                self._scratch,
-                actions,
-            )
-            chosen[lanes] = actions
-        return torch.from_numpy(chosen.reshape(observation.shape[:2])).to(observation.device)
-
-    def _by_plan(self, plans: Int64 | None) -> list[tuple[Any, Sequence[int]]]:
-        """Return each plan with the agents that follow it, as indices into [replicas x k x S]."""
         if plans is None:
-            return [(slice(None), self._plan)]
-        kinds, kind = np.unique(plans.reshape(-1, plans.shape[-1]), axis=0, return_inverse=True)
-        return [(np.flatnonzero(kind.ravel() == index), plan) for index, plan in enumerate(kinds.tolist())]
+            plans = np.tile(self._plan, (len(framed), 1))
+        compiled_for_cpu(scripted_rules.choose_all, inline=False)(
+            np.ascontiguousarray(plans.reshape(len(framed), -1)),
+            epsilon,
+            framed,
+            np.take(_ROLES, framed),
+            self._frame,
+            self._numbers(),
+            self._settings,
+            self._scratch,
+            chosen,
+        )
+        return torch.from_numpy(chosen.reshape(observation.shape[:2])).to(observation.device)
 
     def _framed(self, observation: Tensor, apple_ahead: Tensor | None) -> UInt8:
         """Return the classes of the cells in each agent's window, with a frame of wall around them: uint8
@@ -255,7 +233,7 @@ class ScriptedActor(ActorOfLanes):
         framed[:, row, middle] = cells.GROUND
         if apple_ahead is not None:
             cell_ahead = framed[:, row - 1, middle]  # a wall of the frame if the window has a single row
-            is_open = _roles(())[cell_ahead] == OPEN
+            is_open = _ROLES[cell_ahead] == OPEN
             cell_ahead[apple_ahead.numpy(force=True).reshape(-1) & is_open] = cells.APPLE
         return framed.reshape(count, -1)
 
@@ -284,24 +262,21 @@ def scripted_lanes(
             f"Scripted({policy!r}) reads the window of a cprl.Game; in a game of another kind, allowed: "
             "'random'"
         )
-    return ScriptedActor(policy, playing, seeds=seeds, agents=agents, worlds=worlds)
+    return ScriptedActor(Plan(policy), playing, seeds=seeds, agents=agents, worlds=worlds)
 
 
 def _settings(game: Game) -> Settings:
-    """Return the properties of a game by which scripted agents choose; those of plans are 0."""
+    """Return the properties of a game by which scripted agents choose."""
     rules = game.rules
     return Settings(
         actions=game.tables.silent_actions,
         stay=game.actions.index("stay"),
-        fires=False,
+        may_fire=rules.may_fire,
         beam_length=min(rules.beam_lengths_cells),
         beam_half_width=min(rules.beam_width_cells, rules.window_columns) // 2,
         beam_tapers=rules.beam_tapers,
         beam_from_beside=rules.beam_from_beside,
         beam_stops_at_agents=rules.beam_stops_at_agents,
-        spare=0,
-        region_rows=0,
-        region_columns=0,
     )
 
 
@@ -324,14 +299,15 @@ def _frame(game: Game) -> tuple[int, Frame]:
     )
 
 
-@cache
-def _roles(foes: tuple[int, ...]) -> UInt8:
-    """Return the role of each class of cell, uint8 [256]; `foes`: 1 for each agent that is fired at."""
-    roles = np.full(256, FOE if all(foes) else AGENT, np.uint8)
-    roles[cells.FIRST_AGENT : cells.FIRST_AGENT + len(foes)] = np.where(foes, FOE, AGENT)
+def _roles() -> UInt8:
+    """Return the role of each class of cell, uint8 [256]."""
+    roles = np.full(256, AGENT, np.uint8)
     open_ground = (cells.GROUND, cells.MARK, cells.BEAM)
     roles[[*open_ground, cells.WATER, cells.WASTE, cells.CLEANING]] = OPEN
     roles[cells.APPLE] = APPLE
     roles[cells.WALL] = WALL
     roles[UNSEEN] = UNKNOWN
     return roles
+
+
+_ROLES: Final = _roles()

@@ -11,6 +11,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from cprl.commons.cells import FIRST_AGENT
 from cprl.values.array_types import Bool, Float64, Int32, Int64, UInt8
 
 OPEN, APPLE, AGENT, FOE, UNKNOWN, WALL = range(6)
@@ -153,8 +154,7 @@ class Settings(NamedTuple):
     """The number of actions without a signal: these agents are silent."""
     stay: int
     """The index of the action "stay"."""
-    fires: bool
-    """Whether the agent has a beam, and fires at anyone."""
+    may_fire: bool
     beam_length: int
     """The cells ahead that a beam covers for every heading, since an agent does not know its heading."""
     beam_half_width: int
@@ -162,27 +162,35 @@ class Settings(NamedTuple):
     beam_tapers: bool
     beam_from_beside: bool
     beam_stops_at_agents: bool
-    spare: int
-    """The number of other apples near an apple that "sustainable" harvests."""
-    region_rows: int
-    """The rows ahead in which the agent harvests."""
-    region_columns: int
-    """The columns to each side in which the agent harvests."""
 
 
-def is_in_region(frame: Frame, settings: Settings, cell: int) -> bool:
+POLICY, SPARED, REGION_ROWS, REGION_COLUMNS, FOES = range(5)
+"""The indices of the numbers of `cprl.policies.scripted.Plan`; those from FOES on are of agents."""
+
+
+def mark_foes(roles: UInt8, classes: UInt8, foes: Int64) -> None:
+    """Make the agents at whom this one fires FOE; those that look alike are if it fires at all."""
+    fires_at_all = foes.all()
+    for cell in range(roles.size):
+        if roles[cell] == AGENT:
+            agent = int(classes[cell]) - FIRST_AGENT
+            if fires_at_all or (agent >= 0 and foes[agent]):
+                roles[cell] = FOE
+
+
+def is_in_region(frame: Frame, plan: Int64, cell: int) -> bool:
     """Return whether the agent harvests at a cell."""
     ahead = frame.middle // frame.stride - cell // frame.stride
     side = abs(cell % frame.stride - frame.middle % frame.stride)
-    return ahead <= settings.region_rows and side <= settings.region_columns
+    return bool(ahead <= plan[REGION_ROWS] and side <= plan[REGION_COLUMNS])
 
 
-def target_apples(roles: UInt8, frame: Frame, settings: Settings, scratch: SearchBuffers) -> None:
+def target_apples(roles: UInt8, frame: Frame, plan: Int64, scratch: SearchBuffers) -> None:
     """Make the apples of the agent's region targets; block all other apples, and other agents."""
     for cell in frame.cells:
         scratch.targets[cell] = roles[cell] == APPLE
         scratch.blocked[cell] = is_agent(roles[cell])
-        if scratch.targets[cell] and not is_in_region(frame, settings, cell):
+        if scratch.targets[cell] and not is_in_region(frame, plan, cell):
             exclude_apple(scratch, cell)
 
 
@@ -192,10 +200,10 @@ def exclude_apple(scratch: SearchBuffers, cell: int) -> None:
     scratch.blocked[cell] = True
 
 
-def exclude_sparse_apples(roles: UInt8, frame: Frame, settings: Settings, scratch: SearchBuffers) -> None:
-    """Exclude the targets with fewer than `spare` other apples near them."""
+def exclude_sparse_apples(roles: UInt8, frame: Frame, spared: int, scratch: SearchBuffers) -> None:
+    """Exclude the targets with fewer than `spared` other apples near them."""
     for cell in frame.cells:
-        if scratch.targets[cell] and apples_near(roles, frame, cell) < settings.spare:
+        if scratch.targets[cell] and apples_near(roles, frame, cell) < spared:
             exclude_apple(scratch, cell)
 
 
@@ -263,21 +271,30 @@ def pursue(roles: UInt8, frame: Frame, number: float, settings: Settings, scratc
 
 
 def choose(
-    policy: int, roles: UInt8, frame: Frame, numbers: Float64, settings: Settings, scratch: SearchBuffers
+    policy: int,
+    plan: Int64,
+    roles: UInt8,
+    frame: Frame,
+    numbers: Float64,
+    settings: Settings,
+    scratch: SearchBuffers,
 ) -> int:
     """Choose the action of one agent.
 
     Args:
+        policy: the policy by which it chooses in this turn.
+        plan: int64 [4 + N], the numbers of its plan.
         roles: uint8 [cells], the roles of the cells of its framed window.
         numbers: float64 [NUMBERS], uniform random numbers in [0, 1).
     """
     if policy == RANDOM:
         return int(numbers[WHICH] * settings.actions)
-    if settings.fires and has_target(roles, frame, settings, policy == TERRITORIAL):
+    fires = settings.may_fire and plan[FOES:].any()
+    if fires and has_target(roles, frame, settings, policy == TERRITORIAL):
         return BEAM
-    target_apples(roles, frame, settings, scratch)
+    target_apples(roles, frame, plan, scratch)
     if policy == SUSTAINABLE:
-        exclude_sparse_apples(roles, frame, settings, scratch)
+        exclude_sparse_apples(roles, frame, plan[SPARED], scratch)
     elif policy == PACIFIST:
         exclude_apples_nearer_to_others(roles, frame, scratch)
     count_own_steps(roles, frame, scratch)
@@ -285,7 +302,7 @@ def choose(
         action = pursue(roles, frame, numbers[WAITS], settings, scratch)
         if action >= 0:
             return action
-        target_apples(roles, frame, settings, scratch)
+        target_apples(roles, frame, plan, scratch)
     goal = nearest(frame, scratch)
     if goal < 0:
         return wander(roles, frame, numbers[WANDERS], scratch)
@@ -293,8 +310,9 @@ def choose(
 
 
 def choose_all(
-    policy: int,
+    plans: Int64,
     epsilon: float,
+    classes: UInt8,
     roles: UInt8,
     frame: Frame,
     numbers: Float64,
@@ -305,10 +323,13 @@ def choose_all(
     """Choose the actions of n agents; each is random with probability `epsilon`.
 
     Args:
-        roles: uint8 [n, cells], the roles of the cells of each framed window.
+        plans: int64 [n, 4 + N], the numbers of the plan of each agent.
+        classes: uint8 [n, cells], the classes of the cells of each framed window.
+        roles: uint8 [n, cells], their roles, of agents AGENT; those at whom an agent fires become FOE.
         numbers: float64 [n, NUMBERS], uniform random numbers in [0, 1).
         chosen: int64 [n], receives the actions.
     """
     for n in range(roles.shape[0]):
-        followed = RANDOM if numbers[n, EXPLORES] < epsilon else policy
-        chosen[n] = choose(followed, roles[n], frame, numbers[n], settings, scratch)
+        policy = RANDOM if numbers[n, EXPLORES] < epsilon else plans[n, POLICY]
+        mark_foes(roles[n], classes[n], plans[n, FOES:])
+        chosen[n] = choose(policy, plans[n], roles[n], frame, numbers[n], settings, scratch)

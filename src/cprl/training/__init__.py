@@ -5,6 +5,7 @@ Modules, in the order in which one reads them:
     nan_check   what is NaN or infinite in a training, found and named
     governing   a governor in a training: what it decides by, its periods, how it learns
     training    Training: one step after the other, with a state that can be read and set; train; callbacks
+    pools       PoolActor: an agent that is played by another opponent in each episode
     stored      load: agents that an earlier run learned, and how they play
     agents      Population: the agents of an experiment, of whatever kind
     evaluating  what is made of an experiment, and the trained agents in fresh worlds

@@ -1,9 +1,8 @@
 """Population: the agents of an experiment that learn, follow a script, or were trained by an earlier run."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import replace
-from functools import partial
-from typing import Any, get_args
+from functools import cache, partial
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -23,7 +22,7 @@ from cprl.networks.recurrent import state_shape_of
 from cprl.objectives.rewards import reward_name
 from cprl.policies.asking import Calls
 from cprl.policies.decisions import Bandit, BanditDecider, ballot_sizes
-from cprl.policies.governors import GovernorActor, Script, governor_spaces
+from cprl.policies.governors import GovernorActor, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_names, lane_seeds
@@ -34,6 +33,7 @@ from cprl.population import (
     GovernorSpec,
     Language,
     Learning,
+    OwnPast,
     Pool,
     Scripted,
     Team,
@@ -43,21 +43,21 @@ from cprl.population import (
     refuse_sharing,
     refuse_undecided,
     specs_by_agent,
+    stored_in,
 )
 from cprl.training.governing import Governing
+from cprl.training.pools import PoolActor
 from cprl.training.stored import (
     LoadedRun,
-    PoolActor,
     StoredAgent,
     decision_values,
     load,
-    rule_follower,
     stored_actors,
+    stored_agent,
     stored_governor,
     stored_policies,
-    trained_agent,
 )
-from cprl.values import instantiate, short_repr
+from cprl.values import checked, instantiate
 
 
 def _refuse_only_in_play(learner: Learner, env: EnvBase) -> None:
@@ -78,7 +78,8 @@ class Population:
         seed: the seed of the run; each agent of each replica has its own random numbers.
         worlds: the worlds W of each replica; world b of `env` belongs to replica b // W.
         first_replica: the number of the first replica, so that replica r can be trained alone.
-        engine: "compiled", "eager" or "torchrl", see `Experiment.engine`.
+        engine: "compiled", "eager" or "torchrl", see `Experiment.engine`; "auto" is for an experiment, which
+            says how long it trains.
         starts: whether agents with `start_from` get the stored weights; False if a checkpoint with later
             weights is loaded next.
         weights: the names of the weights of `Frozen` agents by run, see `cprl.load`; runs not in it have
@@ -95,18 +96,13 @@ class Population:
         seed: int = 0,
         worlds: int = 1,
         first_replica: int = 0,
-        engine: str = "compiled",
+        engine: TrainingEngine = "compiled",
         starts: bool = True,
         weights: Mapping[str, str] | None = None,
         governor: GovernorSpec | None = None,
         governor_from_turn: int = 0,
     ) -> None:
-        known = get_args(TrainingEngine)
-        if engine not in known:
-            more = '; "auto" is for an Experiment, which says how long it trains' * (engine == "auto")
-            raise ValueError(
-                f"engine is {short_repr(engine)}; allowed: {', '.join(map(short_repr, known))}{more}"
-            )
+        checked("engine", engine, TrainingEngine)
         refuse_people(specs)
         self.spaces = spaces_of(env)
         self.specs = tuple(specs)
@@ -128,8 +124,18 @@ class Population:
             if isinstance(spec, Learning | Team):
                 self.learners[agents] = self._make_learner(spec, agents, engine, self.spaces, starts=starts)
                 _refuse_only_in_play(self.learners[agents], env)
-        self._pools: dict[int, PoolActor] = {}
         self._stored_agents = self._load_stored_agents(weights or {})
+        self._pools = {
+            agent: PoolActor(
+                stored,
+                partial(stored_actors, playing=self.playing, worlds=worlds),
+                seeds=self._seeds(Purpose.EXPLORATION)(agents=[agent]),
+                worlds=worlds,
+                present=self._present,
+            )
+            for agent, stored in self._stored_agents.items()
+            if isinstance(self._specs_by_agent[agent], Pool)
+        }
         self.governor = self._make_governor(governor, governor_from_turn)
         """The governor, which counts as the agent after the last one, and how it learns; None without one."""
         self.others: dict[ActorAgents, nn.Module] = self.other_actors(Purpose.EXPLORATION, worlds=worlds)
@@ -159,7 +165,7 @@ class Population:
 
     def random_policy(self, worlds: int) -> JointPolicy:
         """Return policies that take every action, and every choice of a decision, with equal probability."""
-        agents = [[StoredAgent(scripted="random")] * self.replicas] * len(self._specs_by_agent)
+        agents = [[StoredAgent(spec=Scripted("random"))] * self.replicas] * len(self._specs_by_agent)
         return stored_policies(
             agents,
             self.playing,
@@ -193,16 +199,17 @@ class Population:
         return networks
 
     def _make_governor(self, spec: GovernorSpec | None, from_turn: int) -> Governing | None:
-        if self._game is None or self._game.governor is None:
+        if spec is None:
             return None
+        assert self._game is not None
+        assert self._game.governor is not None
         actor = self._stored_governor(Purpose.EXPLORATION, self.worlds)
         learner = None
         if isinstance(spec, Learning):
             spaces = governor_spaces(self._game)
             learner = self._make_learner(spec, (self.spaces.agents,), "eager", spaces)
             actor = GovernorActor(self._game.governor, learner.actor)
-        if actor is None:
-            return None
+        assert actor is not None
         actor.from_turn = from_turn
         return Governing(self._game, actor, learner)
 
@@ -216,55 +223,43 @@ class Population:
         for agent, spec in enumerate(self._specs_by_agent):
             if isinstance(spec, Learning | Team):
                 lanes = [lane_name(replica, agent) for replica in replicas]
-                agents.append([trained_agent(spec, networks[lane], decisions.get(lane)) for lane in lanes])
+                agents.append(
+                    [
+                        StoredAgent(spec=spec, network=networks[lane], decisions=decisions.get(lane))
+                        for lane in lanes
+                    ]
+                )
             else:
                 agents.append([others[agent][self._replica_numbers.index(replica)] for replica in replicas])
         return agents
 
     def _load_stored_agents(self, weights: Mapping[str, str]) -> dict[int, list[StoredAgent]]:
-        """Make the pools; return the scripted and frozen agents of each replica by index, the governor last.
-        Each stored run is read once."""
-        runs: dict[str, LoadedRun] = {}
-
-        def frozen(spec: Frozen, *, governs: bool = False) -> list[StoredAgent]:
-            if spec.run not in runs:
-                runs[spec.run] = load(spec.run, weights=weights.get(spec.run))
-            run = runs[spec.run]
-            if governs:
-                _refuse_other_governor(run, spec, self._game)
-            else:
-                _refuse_other_game(run, self.spaces, self._game, is_to_decide=True)
-            replicas = map(spec.replica_for, self._replica_numbers)
-            stored = [run.agent(spec.agent, replica=replica) for replica in replicas]
-            return [replace(one, calls=self.calls) for one in stored]
-
-        seeds = self._seeds(Purpose.EXPLORATION)
+        """Return the agents of each replica that do not learn by index, pools without past selves. Each
+        stored run is read once."""
+        earlier = cache(lambda run: load(run, weights=weights.get(run)))
         agents: dict[int, list[StoredAgent]] = {}
         for agent, spec in enumerate(self._specs_by_agent):
-            if isinstance(spec, Script | Scripted | Language):
-                agents[agent] = [rule_follower(spec, self.calls)] * self.replicas
-            elif isinstance(spec, Frozen):
-                agents[agent] = frozen(spec, governs=agent == self.spaces.agents)
-            elif isinstance(spec, Pool):
-                self._pools[agent] = PoolActor(
-                    list(map(frozen, spec.runs)),
-                    self.playing,
-                    seeds=seeds(agents=[agent]),
-                    worlds=self.worlds,
-                    draw=spec.draw,
-                    own_past=spec.own_past,
-                    present=partial(self._present, spec.own_past),
-                )
+            if isinstance(spec, Learning | Team):
+                continue
+            for frozen in stored_in(spec).values():
+                if agent == self.spaces.agents:
+                    _refuse_other_governor(earlier(frozen.run), frozen, self._game)
+                else:
+                    _refuse_other_game(earlier(frozen.run), self.spaces, self._game, is_to_decide=True)
+            agents[agent] = [
+                stored_agent(spec, replica, calls=self.calls, load=earlier)
+                for replica in self._replica_numbers
+            ]
         return agents
 
-    def _present(self, own_past: Any) -> list[StoredAgent]:
+    def _present(self, own_past: OwnPast) -> list[StoredAgent]:
         """Return copies of the agent of an `OwnPast` as it is now, of each replica."""
         agent = own_past.agent
-        spec: Any = self._specs_by_agent[agent]
+        spec = self._specs_by_agent[agent]
         (learner,) = (learner for agents, learner in self.learners.items() if agent in agents)
         networks = learner.networks()
         names = lane_names(replicas=self._replica_numbers, agents=[agent])
-        return [trained_agent(spec, networks[name], None) for name in names]
+        return [StoredAgent(spec=spec, network=networks[name]) for name in names]
 
     def _others_as_stored(self) -> dict[int, list[StoredAgent]]:
         """Return the agents of each replica that do not learn by index, pools as they are now."""
@@ -304,7 +299,7 @@ class Population:
         return partial(lane_seeds, self.seed, replicas=numbers, purpose=purpose)
 
     def _make_decider(self) -> BanditDecider | None:
-        sizes = () if self._game is None else ballot_sizes(self._game)
+        sizes = ballot_sizes(self._game)
         refuse_undecided(self.specs, len(sizes))
         if not sizes:
             return None
@@ -366,9 +361,9 @@ class Population:
         weights = {}
         for replica in self._replica_numbers:
             stored_replica = source.replica_for(replica)
-            for agent, stored_agent in zip(agents, sources, strict=True):
-                where = f"{lane_name(stored_replica, stored_agent)} of {source.run}"
-                stored = run.agent(stored_agent, replica=stored_replica)
+            for agent, source_agent in zip(agents, sources, strict=True):
+                where = f"{lane_name(stored_replica, source_agent)} of {source.run}"
+                stored = run.agent(source_agent, replica=stored_replica)
                 weights[lane_name(replica, agent)] = _loadable_weights(stored, algorithm, self.spaces, where)
         return weights
 
@@ -495,10 +490,11 @@ def _loadable_weights(
     name = type(algorithm).__name__
     if stored.network is None:
         raise ValueError(f"{where} is scripted, without weights; allowed: an agent that learned")
-    if stored.stochastic != algorithm.stochastic:
+    is_stochastic = stored.algorithm.stochastic
+    if is_stochastic != algorithm.stochastic:
         meanings = {True: "the logits of a policy", False: "action values"}
         raise ValueError(
-            f"the network of {where} outputs {meanings[stored.stochastic]}; {name} learns "
+            f"the network of {where} outputs {meanings[is_stochastic]}; {name} learns "
             f"{meanings[algorithm.stochastic]}"
         )
     weights = stored.network.state_dict()

@@ -149,19 +149,14 @@ class Evaluations:
     `evaluation/training.parquet` has a row for each of its episodes and agents.
     """
 
-    def __init__(self, run: Path, experiment: Experiment, env: EnvBase, population: Population) -> None:
+    def __init__(self, run: Path, experiment: Experiment, population: Population) -> None:
         self._run = run
         self._experiment = experiment
-        self._env = env
-        """The worlds of the training, whose transforms the evaluations share."""
         self._population = population
         self._tables: list[pa.Table] = []
 
     def on_start(self, training: Any) -> None:
-        self._env = training.env
-
-    def on_game(self, env: EnvBase, changes: str) -> None:
-        self._env = env
+        self._training = training
 
     def on_ended(self, ended: Sequence[tuple[Episode, dict[str, float]]]) -> None:
         every = self._experiment.evaluate_every
@@ -189,7 +184,7 @@ class Evaluations:
         played: dict[int, list[Episode]] = {}
         for group in consecutive_groups(sorted(replicas)):
             env = make_worlds(experiment, len(group) * worlds, first=group[0] * worlds, fresh=True)
-            load_transforms_state(env, transforms_state(self._env))
+            load_transforms_state(env, transforms_state(self._training.env))
             stored = self._population.as_stored(group)
             playing = self._population.playing
             policies = stored_policies(stored, playing, replicas=group, worlds=worlds, seed=seed)

@@ -63,17 +63,12 @@ class Governing:
             now = {name: np.where(before[keys.DONE], before[name], entry) for name, entry in now.items()}
         self._period = now
         if self.actor.is_due:
-            self._learn(self.learner)
+            self.learner.store(self._transitions())
+            loss = self.learner.update()
+            self.learner.end_episode(torch.from_numpy(now[keys.DONE][:, 0]))
+            if loss is not None:
+                self._loss = loss.cpu()
             self._period = {}
-
-    def _learn(self, learner: Learner) -> None:
-        """Learn from the period that has ended."""
-        batch = self._transitions()
-        learner.store(batch)
-        loss = learner.update()
-        learner.end_episode(batch["next", keys.DONE][:, 0])
-        if loss is not None:
-            self._loss = loss.cpu()
 
     def _transitions(self) -> TensorDict:
         """Return the period as a turn of agents of which the last is the governor."""
@@ -116,6 +111,5 @@ class Governing:
         self.actor.load_state_dict(state["actor"])
         if self.learner is not None:
             self.learner.load_state_dict(state["learner"])
-        period = state["period"]
-        self._period = {name: entry.view(len(entry), -1).numpy() for name, entry in period.items()}
+        self._period = {name: entry.numpy() for name, entry in state["period"].items()}
         self._loss = state["loss"]

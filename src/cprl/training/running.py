@@ -1,16 +1,15 @@
 """run: train an experiment, save its agents, evaluate them in fresh worlds, and report."""
 
 import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import pyarrow as pa
 import torch
-from torchrl.envs import EnvBase
 
 from cprl.commons.threads import MOST_THREADS
 from cprl.envs.env_state import transforms_state
@@ -61,7 +60,6 @@ from cprl.terminal.course import NEEDED, course_of
 from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
-from cprl.training.agents import Population
 from cprl.training.evaluating import (
     Evaluations,
     evaluate_population,
@@ -138,7 +136,7 @@ def run(
     """
     times = Times()
     _prepare(experiment, watch, linger=linger, threads=threads)
-    opened = _open_run(experiment, out, resume=resume, callbacks=callbacks)
+    opened = _OpenRun(experiment, out, resume=resume, callbacks=callbacks)
     directory = opened.directory
     if opened.step == "already_finished" and not (directory / LOCK_FILE).exists():
         return _say_finished(directory, opened.experiment)
@@ -166,61 +164,39 @@ def run(
     return directory
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
 class _OpenRun:
-    """A run whose directory, worlds and agents exist, before its training begins."""
+    """A run whose directory, worlds and agents exist, before its training begins.
 
-    requested: Experiment
-    """The experiment of the caller, whose engine may be "auto"."""
-    experiment: Experiment
-    """The experiment with the engine that trains it."""
-    resume: bool
-    """True for a run that is resumed or extended, False for a new one."""
-    directory: Path
-    is_new: bool
-    """True if the directory did not exist before."""
-    step: Step
-    """The step that was due when the run was opened."""
-    env: EnvBase
-    earlier: Sequence[tuple[EnvBase, int]]
-    """The worlds of earlier games, see `Experiment.earlier`."""
-    population: Population
-    observers: Sequence[Any]
-    """The callbacks of the experiment and of the caller."""
-    metric_words: Mapping[str, Mapping[str, str]]
-    """The "title" and "unit" of custom metrics."""
+    Opening it refuses what would fail later, and makes the directory of a new run last.
+    """
 
-
-def _open_run(
-    requested: Experiment, out: Path | str | None, *, resume: bool, callbacks: Sequence[object]
-) -> _OpenRun:
-    """Make the worlds, the agents and the directory of a run; refuse what would fail later."""
-    out = None if out is None else Path(out)
-    is_new = out is None or not out.exists()
-    resumed = out if resume else None
-    experiment = _with_engine(requested, resumed)
-    state, _, step = _find_next_step(out, experiment, resume=resume)
-    with working("making agents"):
-        partners = partners_in(experiment.specs)
-        weights = {} if resumed is None else frozen_weights_names(resumed, partners)
-        env, population = make_agents(experiment, starts=state in ("missing", "begun"), weights=weights)
-        earlier = make_earlier(experiment, env, population)
-    observers = [*map(instantiate, experiment.callbacks), *callbacks]
-    check_callbacks(observers)
-    metric_words = try_custom_metrics(experiment.metrics, env)
-    return _OpenRun(
-        requested=requested,
-        experiment=experiment,
-        resume=resume,
-        directory=start(out, experiment, partners) if resumed is None else resumed,
-        is_new=is_new,
-        step=step,
-        env=env,
-        earlier=earlier,
-        population=population,
-        observers=observers,
-        metric_words=metric_words,
-    )
+    def __init__(
+        self, requested: Experiment, out: Path | str | None, *, resume: bool, callbacks: Sequence[object]
+    ) -> None:
+        out = None if out is None else Path(out)
+        resumed = out if resume else None
+        self.requested = requested
+        """The experiment of the caller, whose engine may be "auto"."""
+        self.experiment = _with_engine(requested, resumed)
+        """The experiment with the engine that trains it."""
+        self.resume = resume
+        """True for a run that is resumed or extended, False for a new one."""
+        self.is_new = out is None or not out.exists()
+        """True if the directory did not exist before."""
+        state, _, self.step = _find_next_step(out, self.experiment, resume=resume)
+        with working("making agents"):
+            partners = partners_in(self.experiment.specs)
+            weights = {} if resumed is None else frozen_weights_names(resumed, partners)
+            starts = state in ("missing", "begun")
+            self.env, self.population = make_agents(self.experiment, starts=starts, weights=weights)
+            self.earlier = make_earlier(self.experiment, self.env, self.population)
+            """The worlds of earlier games, see `Experiment.earlier`."""
+        self.observers: list[Any] = [*map(instantiate, self.experiment.callbacks), *callbacks]
+        """The callbacks of the experiment and of the caller."""
+        check_callbacks(self.observers)
+        self.metric_words = try_custom_metrics(self.experiment.metrics, self.env)
+        """The "title" and "unit" of custom metrics."""
+        self.directory = start(out, self.experiment, partners) if resumed is None else resumed
 
 
 def _begin(run: _OpenRun) -> bool:
@@ -368,7 +344,7 @@ def _play_at_random(run: _OpenRun, viewer: "ViewerCallback | None") -> list[Epis
 def _train(run: _OpenRun, viewer: "ViewerCallback | None", checkpointer: Checkpointer) -> Training:
     """Train, and save what the agents have learned."""
     viewers = [] if viewer is None else [viewer]
-    evaluations = Evaluations(run.directory, run.experiment, run.env, run.population)
+    evaluations = Evaluations(run.directory, run.experiment, run.population)
     with _loggers(run.experiment, run.directory, resumes=run.resume) as loggers:
         table = EpisodeTable(run.directory / "episodes.parquet", resumable=True)
         with table, ProgressBar.of(run.experiment, run.population.calls.in_words) as progress_bar:
@@ -413,7 +389,7 @@ def _evaluate(
     tables = write_evaluation(run.directory, episodes, replicas=run.experiment.replicas)
     if viewer is not None:
         viewer.finished(episodes)
-    trained = _trained_label(list(run.population.learners.values()))
+    trained = _trained_label(run.population.learners.values())
     random_table = labelled(tables["random"], policy="random")
     trained_table = labelled(tables["trained"], policy=trained)
     return store_agent_names(pa.concat_tables([random_table, trained_table]), agent_names(run.env))
@@ -452,7 +428,7 @@ def _summarise(run: _OpenRun, training: Training, evaluation: pa.Table, figure: 
     )
 
 
-def _trained_label(learners: Sequence[Learner]) -> str:
+def _trained_label(learners: Collection[Learner]) -> str:
     """Return the label of trained agents in tables, with the epsilons of those that explore by one.
 
     Examples: "trained", "trained, epsilon 0.05", "agents" if no agent learns.

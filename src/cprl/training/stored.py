@@ -1,8 +1,8 @@
 """Stored agents of earlier runs, read by `load`, their policies, and checks that runs have the same game."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property, partial
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -10,7 +10,6 @@ from typing import Any, Final
 import numpy as np
 import pyarrow as pa
 import torch
-from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.envs import EnvBase
 
@@ -19,27 +18,24 @@ from cprl.commons.spaces import Spaces
 from cprl.envs.env_state import load_transforms_state
 from cprl.envs.make_env import make_env, spaces_of, stored_game
 from cprl.experiment import Experiment
-from cprl.keys import recurrent_state
 from cprl.networks.agent import acting_network
 from cprl.networks.finite import all_finite
 from cprl.networks.recurrent import state_cells_of
 from cprl.networks.stacked import stack_lanes
 from cprl.policies.actors import LaneActor
 from cprl.policies.asking import CALLS, Calls
-from cprl.policies.decisions import ballot_sizes, stored_decisions
+from cprl.policies.decisions import Decider, ballot_sizes
 from cprl.policies.governors import GovernorActor, Script, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
-from cprl.policies.rng import LaneRng, Purpose, lane_name, lane_seeds
-from cprl.policies.scripted import ScriptedPolicy, scripted_lanes
+from cprl.policies.rng import Purpose, lane_name, lane_seeds
+from cprl.policies.scripted import scripted_lanes
 from cprl.population import (
     AgentSpec,
-    Draw,
     Frozen,
     GovernorSpec,
     Language,
     Learning,
-    OwnPast,
     Person,
     Pool,
     Scripted,
@@ -50,7 +46,7 @@ from cprl.runs.checkpoints import CHECKPOINTS
 from cprl.runs.episodes import read_episodes
 from cprl.runs.recipe import RECIPE_FILE, changed_code, read_recipe, warn_of_changes
 from cprl.runs.weights import frozen_weights_name, weights_in
-from cprl.system.compat.tensordicts import unchecked_tensordict
+from cprl.training.pools import PoolActor
 from cprl.values import Custom, describe_changes, instantiate, short_repr, to_config
 
 _MOST_DIFFERENCES: Final = 3
@@ -59,33 +55,59 @@ _MOST_DIFFERENCES: Final = 3
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StoredAgent:
-    """An agent that no longer learns: a scripted policy, a network and how it acts by it, or a pool."""
+    """An agent that does not learn, or learns no longer: how it is specified, and what it has learned."""
 
-    scripted: ScriptedPolicy | Script | None = None
-    """The policy that it follows; None for an agent that acts by a network, or a pool."""
-    language: Language | None = None
-    """How a language model makes its plans, where it falls back to `scripted`; None without one."""
-    calls: Calls = field(default_factory=Calls, repr=False)
-    """What keeps the calls of its model."""
+    spec: AgentSpec | GovernorSpec
     network: nn.Module | None = field(default=None, repr=False)
-    stochastic: bool = False
-    """True if the network outputs the logits of a policy; else it outputs action values."""
-    epsilon: float = 0.0
-    """The probability of a random action in evaluation."""
-    algorithm: str = field(default="", repr=False)
-    """The algorithm that it learned by, as text."""
+    """The network by which it acts; None for an agent that did not learn."""
     decisions: Tensor | None = field(default=None, repr=False)
     """The values of its choices on all ballots, float64 [C]; None if it decides at random, or has no
     ballots."""
+    calls: Calls = field(default_factory=Calls, repr=False)
+    """What keeps the calls of its language model."""
     pool: tuple["StoredAgent", ...] = ()
-    """The opponents, oldest first, one of which plays each episode; empty for a single agent."""
-    draw: Draw = "uniform"
-    """How it is drawn which of them plays, see `Pool`."""
+    """The opponents of a `Pool`, oldest first, one of which plays each episode."""
 
     @property
-    def kind(self) -> tuple[Any, ...]:
+    def kind(self) -> str:
         """Return the kind of the agent; agents of one kind can be lanes of one actor."""
-        return self.scripted, self.language, self.stochastic, self.epsilon, self.algorithm
+        return repr(getattr(self.spec, "algorithm", self.spec))
+
+    @cached_property
+    def algorithm(self) -> Any:
+        """Return the algorithm by which an agent with a network learned."""
+        spec: Any = self.spec
+        return instantiate(spec.algorithm)
+
+    @property
+    def epsilon(self) -> float | None:
+        """Return the probability of a random action in evaluation; None for an agent without values of
+        actions."""
+        if self.network is None or self.algorithm.stochastic:
+            return None
+        return getattr(self.algorithm.settings, "epsilon_evaluation", 0.0)
+
+
+def stored_agent(
+    spec: AgentSpec | GovernorSpec, replica: int, *, calls: Calls, load: Callable[[str], "LoadedRun"]
+) -> StoredAgent:
+    """Return an agent of a replica that does not learn there; a pool is without past selves.
+
+    Args:
+        calls: what keeps the calls of a language model.
+        load: loads the run of an agent of an earlier run.
+    """
+    if isinstance(spec, Frozen):
+        agent = load(spec.run).agent(spec.agent, replica=spec.replica_for(replica))
+        return replace(agent, calls=calls)
+    runs = spec.runs if isinstance(spec, Pool) else ()
+    opponents = [stored_agent(run, replica, calls=calls, load=load) for run in runs]
+    if any(isinstance(opponent.spec, Language) for opponent in opponents):
+        raise ValueError(
+            "an opponent of a Pool plays by a language model, which would be asked in episodes of others "
+            "too; allowed: agents that learned, or follow a script"
+        )
+    return StoredAgent(spec=spec, calls=calls, pool=tuple(opponents))
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,8 +126,6 @@ class LoadedRun:
     """The states of the environment's transforms."""
     decisions: Mapping[str, Tensor] = field(default_factory=dict)
     """The values of each lane's decisions, see `cprl.policies.decisions`; empty without ballots."""
-    _earlier: dict[str, "LoadedRun"] = field(default_factory=dict, repr=False)
-    """Other runs whose agents are frozen in this one, read once."""
 
     def __repr__(self) -> str:
         return f"LoadedRun({str(self.path)!r}, {self.experiment!r})"
@@ -177,41 +197,38 @@ class LoadedRun:
         if not 0 <= agent < len(specs):
             raise ValueError(f"agent is {agent}; {self.path} has the agents 0 to {len(specs) - 1}")
         spec = specs[agent]
-        if isinstance(spec, Script | Scripted | Language):
-            return rule_follower(spec, self.calls)
+        lane = lane_name(replica, agent)
         if isinstance(spec, Person):
             raise ValueError(
                 f"agent {agent} of {self.path} is a person: people cannot be played again; allowed: cprl "
                 "table, report, show and film, which read what they played"
             )
-        if isinstance(spec, Frozen):
-            return self._frozen(replica, spec)
-        lane = lane_name(replica, agent)
-        if isinstance(spec, Pool):
-            opponents = list(map(partial(self._frozen, replica), spec.runs))
-            if spec.own_past is not None:
-                learner: Any = self.specs[spec.own_past.agent]
-                past = [network for name, network in self.networks.items() if name.startswith(f"{lane}/")]
-                newest = past[-spec.own_past.kept :]
-                opponents += [trained_agent(learner, network, None) for network in newest]
-            return StoredAgent(pool=tuple(opponents), draw=spec.draw)
+        if not isinstance(spec, Learning | Team):
+            stored = stored_agent(spec, replica, calls=self.calls, load=self._load_earlier)
+            return replace(stored, pool=(*stored.pool, *self._past_selves(spec, lane)))
         if lane not in self.networks:
             raise ValueError(f"{self.path} keeps no network of {lane}; kept are {sorted(self.networks)}")
         if not all_finite(self.networks[lane].state_dict().values()):
             raise ValueError(
                 f"{self.weights_from}: the weights of {lane} are NaN or infinite; leave that replica out"
             )
-        return trained_agent(spec, self.networks[lane], self._decisions_of(lane))
+        return StoredAgent(spec=spec, network=self.networks[lane], decisions=self._decisions_of(lane))
 
-    def _frozen(self, replica: int, spec: Frozen) -> StoredAgent:
-        """Return the agent of an earlier run that plays in a replica here."""
-        if spec.run not in self._earlier:
-            weights = frozen_weights_name(self.recipe, self.path, spec.run)
-            self._earlier[spec.run] = load(spec.run, weights=weights)
-        return self._earlier[spec.run].agent(spec.agent, replica=spec.replica_for(replica))
+    @cached_property
+    def _load_earlier(self) -> Callable[[str], "LoadedRun"]:
+        """Return a function that loads a run whose agents are frozen in this one, each once."""
+        return cache(lambda run: load(run, weights=frozen_weights_name(self.recipe, self.path, run)))
+
+    def _past_selves(self, spec: AgentSpec | GovernorSpec, lane: str) -> list[StoredAgent]:
+        """Return the past selves in the pool of a lane, oldest first; [] for other agents."""
+        if not isinstance(spec, Pool) or spec.own_past is None:
+            return []
+        learner = self.specs[spec.own_past.agent]
+        networks = [network for name, network in self.networks.items() if name.startswith(f"{lane}/")]
+        return [StoredAgent(spec=learner, network=network) for network in networks[-spec.own_past.kept :]]
 
     def _decisions_of(self, lane: str) -> Tensor | None:
-        sizes = ballot_sizes(self.game) if isinstance(self.game, Game) else ()
+        sizes = ballot_sizes(self.game)
         values = self.decisions.get(lane)
         if not sizes:
             return None
@@ -346,28 +363,6 @@ def _networks(run: LoadedRun, weights: Mapping[str, Any]) -> dict[str, nn.Module
     return networks
 
 
-def rule_follower(spec: Script | Scripted | Language, calls: Calls) -> StoredAgent:
-    """Return an agent that follows a script, or plans by a language model whose calls `calls` keeps."""
-    if isinstance(spec, Language):
-        return StoredAgent(scripted=spec.fallback, language=spec, calls=calls)
-    return StoredAgent(scripted=spec.policy if isinstance(spec, Scripted) else spec)
-
-
-def trained_agent(spec: Learning | Team, network: nn.Module, decisions: Tensor | None) -> StoredAgent:
-    """Return an agent that has learned, with its network and the values of its decisions."""
-    algorithm = instantiate(spec.algorithm)
-    epsilon = 0.0
-    if not algorithm.stochastic:
-        epsilon = getattr(algorithm.settings, "epsilon_evaluation", 0.0)
-    return StoredAgent(
-        network=network,
-        stochastic=algorithm.stochastic,
-        epsilon=epsilon,
-        algorithm=repr(spec.algorithm),
-        decisions=decisions,
-    )
-
-
 def consecutive_groups(replicas: Sequence[int]) -> list[list[int]]:
     """Return ascending numbers in groups without gaps, since the worlds of an environment have none."""
     breaks = np.flatnonzero(np.diff(replicas) > 1) + 1
@@ -396,10 +391,13 @@ def stored_policies(
     seeds = partial(lane_seeds, seed, replicas=replicas, purpose=purpose)
     governor = stored_governor(by_index.pop(playing.agents, ()), playing, seeds=seeds, worlds=worlds)
     decisions = None
-    if isinstance(playing, Game):
-        stored = decision_values(by_index)
-        decisions = stored_decisions(
-            playing, stored, replicas=replicas, worlds=worlds, seed=seed, purpose=decides
+    if sizes := ballot_sizes(playing):
+        decisions = Decider(
+            sizes,
+            seeds=lane_seeds(seed, replicas=replicas, agents=range(playing.agents), purpose=decides),
+            agents=playing.agents,
+            worlds=worlds,
+            stored=decision_values(by_index),
         )
     actors = stored_actors(by_index, playing, seeds=seeds, worlds=worlds, stacks=True)
     return JointPolicy(actors, decisions=decisions, governor=governor)
@@ -422,7 +420,7 @@ def stored_governor(
         return None
     assert isinstance(playing, Game)
     assert playing.governor is not None
-    by: Any = stored[0].scripted
+    by: Any = stored[0].spec
     if not isinstance(by, Script):
         lanes = {playing.agents: stored}
         actors = stored_actors(lanes, governor_spaces(playing), seeds=seeds, worlds=worlds, stacks=True)
@@ -432,11 +430,10 @@ def stored_governor(
 
 def decision_values(agents: Mapping[int, Sequence[StoredAgent]]) -> dict[int, list[Tensor]]:
     """Return the values of the decisions of agents that have any, in each replica."""
-    values = {}
+    values: dict[int, list[Any]] = {}
     for agent, replicas in agents.items():
-        decisions = [stored.decisions for stored in replicas if stored.decisions is not None]
-        if decisions:
-            values[agent] = decisions
+        if replicas[0].decisions is not None:
+            values[agent] = [stored.decisions for stored in replicas]
     return values
 
 
@@ -462,44 +459,36 @@ def stored_actors(
         asks: whether language models are asked; without, their agents follow the fallback.
     """
     indices_by_kind: dict[Any, list[int]] = {}
-    spaces = playing.spaces if isinstance(playing, Game) else playing
     actors: dict[ActorAgents, nn.Module] = {}
-    said: dict[Any, Any] = {}
     for agent in sorted(agents):
         replicas = agents[agent]
-        if replicas[0].pool:
-            actors[agent,] = PoolActor(
-                list(zip(*[stored.pool for stored in replicas], strict=True)),
-                playing,
-                seeds=seeds(agents=[agent]),
-                worlds=worlds,
-                draw=replicas[0].draw,
-            )
+        if isinstance(replicas[0].spec, Pool):
+            make_actors = partial(stored_actors, playing=playing, worlds=worlds)
+            actors[agent,] = PoolActor(replicas, make_actors, seeds=seeds(agents=[agent]), worlds=worlds)
         else:
             kind = replicas[0].kind if kinds is None else kinds[agent]
             indices_by_kind.setdefault(kind, []).append(agent)
+    said: dict[Any, Any] = {}
     for indices in indices_by_kind.values():
         by_replica = zip(*[agents[agent] for agent in indices], strict=True)
         lanes = list(chain.from_iterable(by_replica))
         size: dict[str, Any] = {"seeds": seeds(agents=indices), "agents": len(indices), "worlds": worlds}
-        stored = lanes[0]
-        if stored.language is not None and asks:
-            actors[tuple(indices)] = LanguageActor(
-                stored.language, playing, calls=stored.calls, said=said, **size
-            )
-            continue
-        if stored.scripted is not None:
-            actors[tuple(indices)] = scripted_lanes(stored.scripted, playing, **size)
-            continue
-        networks: list[Any] = [lane.network for lane in lanes]
-        actor = LaneActor(
-            _apply_together(networks, stacks=stacks),
-            spaces.actions,
-            stochastic=stored.stochastic,
-            state_cells=state_cells_of(networks[0]),
-            **size,
-        )
-        actor.epsilon = stored.epsilon
+        actor: Any
+        match lanes[0].spec:
+            case Language() as spec if asks:
+                actor = LanguageActor(spec, playing, calls=lanes[0].calls, said=said, **size)
+            case Language(fallback=policy) | Scripted(policy=policy):
+                actor = scripted_lanes(policy, playing, **size)
+            case _:
+                networks: list[Any] = [lane.network for lane in lanes]
+                actor = LaneActor(
+                    _apply_together(networks, stacks=stacks),
+                    (playing.spaces if isinstance(playing, Game) else playing).actions,
+                    stochastic=lanes[0].algorithm.stochastic,
+                    state_cells=state_cells_of(networks[0]),
+                    **size,
+                )
+                actor.epsilon = lanes[0].epsilon or 0.0
         actors[tuple(indices)] = actor
     return actors
 
@@ -516,135 +505,3 @@ def _apply_together(networks: Sequence[nn.Module], *, stacks: bool) -> Callable[
     except ValueError:  # these networks do not stack, e.g. custom ones
         return lambda seen: torch.stack([network(lane) for network, lane in zip(networks, seen, strict=True)])
     return lambda *seen: stack(*seen)
-
-
-class PoolActor(nn.Module):
-    """Plays one agent of every replica by opponents, one of which each world draws for each episode.
-
-    In each turn all opponents choose, by random numbers of their own, and the action of the drawn one counts.
-    The agent's recurrent state is the index of the drawn one plus 1, thus 0 when an episode begins, and then
-    the states of all opponents.
-
-    Args:
-        opponents: the opponents besides past selves, oldest first, each a `StoredAgent` of each replica.
-        seeds: the seed of each replica, see `lane_seeds`; opponents have continuations of it.
-        worlds: the worlds k of each replica.
-        draw: see `Pool`.
-        own_past: the past selves; None for none.
-        present: returns copies of the agent of `own_past` as it is now, a `StoredAgent` of each replica.
-    """
-
-    def __init__(
-        self,
-        opponents: Sequence[Sequence[StoredAgent]],
-        playing: Game | Spaces,
-        *,
-        seeds: Sequence[Sequence[int]],
-        worlds: int,
-        draw: Draw,
-        own_past: OwnPast | None = None,
-        present: Callable[[], Sequence[StoredAgent]] = list,
-    ) -> None:
-        super().__init__()
-        if any(stored.language for replicas in opponents for stored in replicas):
-            raise ValueError(
-                "an opponent of a Pool plays by a language model, which would be asked in episodes of others "
-                "too; allowed: agents that learned, or follow a script"
-            )
-        self.rng = LaneRng(seeds, worlds)
-        self._playing = playing
-        self._seeds = seeds
-        self._worlds = worlds
-        self._draw = draw
-        self._own_past = own_past
-        self._present = present
-        self._first_past = len(opponents)
-        # One more than can be drawn, so that the last one to leave ends its episodes.
-        self._held = own_past.kept + 1 if own_past else 0
-        self._all = [*opponents, *(present() for _ in range(self._held))]
-        self._copies = min(self._held, 1)
-        """The past selves so far; number n has the index `_first_past` + n % `_held`."""
-        self._steps = 0
-        self.policy = self._make_policy()
-        self.state_cells = 1 + len(self._all) * self.policy.state_cells
-        actors: Any = self.policy.actors
-        read = {name for actor in actors for name in actor.in_keys}
-        self.in_keys = (*read - {recurrent_state.AFTER}, recurrent_state.AFTER)
-
-    def _make_policy(self) -> JointPolicy:
-        """Return the policy that plays all opponents as the agents of one game."""
-
-        def seeds(agents: Sequence[int]) -> list[tuple[int, ...]]:
-            return [(*seed, self._copies, opponent + 1) for seed in self._seeds for opponent in agents]
-
-        opponents = dict(enumerate(self._all))
-        return JointPolicy(stored_actors(opponents, self._playing, seeds=seeds, worlds=self._worlds))
-
-    def _newest(self, count: int) -> dict[int, int]:
-        """Return the indices of the newest past selves by their numbers, oldest first."""
-        numbers = range(max(0, self._copies - count), self._copies)
-        return {number: self._first_past + number % self._held for number in numbers}
-
-    @property
-    def _drawable(self) -> list[int]:
-        return [*range(self._first_past), *self._newest(self._held - 1).values()]
-
-    def as_stored(self) -> list[StoredAgent]:
-        """Return the pool of each replica as it is now."""
-        opponents = [self._all[index] for index in self._drawable]
-        return [StoredAgent(pool=pool, draw=self._draw) for pool in zip(*opponents, strict=True)]
-
-    def networks(self) -> dict[str, nn.Module]:
-        """Return the networks of past selves, oldest first, by "replica_0/agent_1/past_0" and so on."""
-        return {
-            f"{lane_name(*seed[1:3])}/past_{number}": stored.network
-            for number, index in self._newest(self._held).items()
-            for seed, stored in zip(self._seeds, self._all[index], strict=True)
-            if stored.network is not None
-        }
-
-    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        left = self._copy_if_due()
-        batch_size = tensordict.batch_size
-        entries = {name: tensordict.get(name) for name in self.in_keys}
-        states = entries.pop(recurrent_state.AFTER)[:, 0]
-        index = self._draw_if_due(states[:, 0].long() - 1, left)[:, None]
-        size = *batch_size, len(self._all)
-        seen = {name: entry.expand(*size, *entry.shape[2:]) for name, entry in entries.items()}
-        seen[recurrent_state.AFTER] = states[:, 1:].reshape(*size, self.policy.state_cells)
-        agents = unchecked_tensordict(seen, batch_size)
-        self.policy(unchecked_tensordict({"agents": agents}, batch_size))
-        states_after = torch.cat([index + 1.0, agents.get(recurrent_state.AFTER).flatten(1)], 1)
-        tensordict.set("action", agents.get("action").gather(1, index))
-        return tensordict.set(recurrent_state.AFTER, states_after[:, None])
-
-    def _draw_if_due(self, index: Tensor, left: int) -> Tensor:
-        """Return the index of each world's opponent, int64 [B], drawn anew where it is -1 or has left."""
-        drawable = torch.tensor(self._drawable, device=index.device)
-        position = (self.rng.next().flatten() * len(drawable)).long().to(index.device)
-        drawn = drawable[position] if self._draw == "uniform" else drawable[-1]
-        return torch.where((index < 0) | (index == left), drawn, index)
-
-    def _copy_if_due(self) -> int:
-        """Copy the agent as it is now; return the index of what left for it, -1 for nothing."""
-        left = -1
-        if self._own_past and self._steps >= self._copies * self._own_past.every_steps:
-            left = self._first_past + self._copies % self._held
-            self._all[left] = self._present()
-            self._copies += 1
-            self.policy = self._make_policy()
-        self._steps += self._worlds
-        return left
-
-    def get_extra_state(self) -> dict[str, Any]:
-        networks = {name: network.state_dict() for name, network in self.networks().items()}
-        counts = {"steps": self._steps, "copies": self._copies}
-        return {"rng": self.rng.state_dict(), **counts, "networks": networks}
-
-    def set_extra_state(self, state: Mapping[str, Any]) -> None:
-        self.rng.load_state_dict(state["rng"])
-        self._steps = state["steps"]
-        self._copies = state["copies"]
-        for name, network in self.networks().items():
-            network.load_state_dict(state["networks"][name])
-        self.policy = self._make_policy()

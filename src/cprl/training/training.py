@@ -425,7 +425,7 @@ class Training:
         if state["carried"] is not None:
             self._step_collector().carried = template.empty(recurse=True).update(state["carried"])
         for name, parts in self._stateful_parts().items():
-            for part, part_state in zip(parts, state.get(name, ()), strict=True):
+            for part, part_state in zip(parts, state[name], strict=True):
                 part.load_state_dict(part_state)
         for name, callback in self._stateful_callbacks().items():
             if name in state["callbacks"]:  # a resumed training may have another viewer
