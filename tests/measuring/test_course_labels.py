@@ -8,7 +8,7 @@ import pytest
 from places import GOLDEN, RESULTS
 from told_courses import SIXTEEN_WORLDS
 
-from cprl.measuring.outcome import Course, outcome_of
+from cprl.measuring.outcome import Course, Outcome, outcome_of
 from cprl.measuring.series import Recent
 from cprl.measuring.table import complete, where
 from cprl.runs.curves import as_curves
@@ -129,6 +129,17 @@ def test_a_mean_counts_episodes_whatever_the_number_that_each_value_is_of():
 def test_noise_around_random_play_is_neither_rise_nor_fall():
     noise = RANDOM + np.random.default_rng(0).normal(0, 20, 500)
     assert labels(noise) == [("begins", 9), ("steady", 491)]
+
+
+@pytest.mark.parametrize(
+    ("peak", "last", "expected"),
+    [(-120, -120, "no better"), (-40, -45, "harvesting"), (-40, -99, "decline"), (-40, -106, "tragedy")],
+)
+def test_negative_incomes_are_better_above_random_play_and_worse_below_it(peak, last, expected):
+    outcome = Outcome(
+        begins=-100, peak=peak, around=10, low=last, last=last, lived=0.5, random=-100.0, agents=4
+    )
+    assert outcome.word == expected
 
 
 @pytest.mark.parametrize("run", [pytest.param(name, marks=pytest.mark.integration) for name in HELD])

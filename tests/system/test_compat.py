@@ -78,8 +78,8 @@ TORCH, RERUN = r"torch \S+ has no torch\.", r"rerun-sdk \S+ has no rerun_binding
         ),
         (
             "torch._inductor.cpu_vec_isa",
-            "valid_vec_isa_list",
-            lambda: torch_compile.remember_vector_instructions.__wrapped__(),
+            "VecISA",
+            torch_compile.trusted_vector_instructions,
             TORCH + r"_inductor\.cpu_vec_isa",
         ),
         (
@@ -762,26 +762,17 @@ def test_recordings_that_nothing_refers_to_end_and_a_closed_logger_leaves_its_la
     assert done.returncode == 0, done.stderr
 
 
-def test_vector_instructions_are_looked_for_once_for_all_processes(tmp_path, monkeypatch):
+def test_vector_instructions_of_the_cpu_are_used_without_compiling(tmp_path, monkeypatch):
     from torch._inductor import cpu_vec_isa
 
-    usable = [kind for kind in cpu_vec_isa.supported_vec_isa_list if str(kind) == "avx2"]
-    assert usable
     monkeypatch.setenv("TORCHINDUCTOR_CACHE_DIR", str(tmp_path))
-    monkeypatch.setattr(cpu_vec_isa, "x86_isa_checker", lambda: ["avx2"])
-    searches = []
-    for found in ([], usable, usable):  # at first the search fails, as it may on a busy machine
-        monkeypatch.setattr(
-            cpu_vec_isa, "valid_vec_isa_list", lambda found=found: searches.append(1) or found
-        )
-        torch_compile.remember_vector_instructions.__wrapped__()  # as in a process of its own
-        assert cpu_vec_isa.valid_vec_isa_list() == cpu_vec_isa.valid_vec_isa_list() == found
-    assert len(searches) == 2, "the third process knows what the second one found"
-    monkeypatch.setattr(cpu_vec_isa, "x86_isa_checker", list)  # another CPU
-    monkeypatch.setattr(cpu_vec_isa, "valid_vec_isa_list", lambda: searches.append(1) or [])
-    torch_compile.remember_vector_instructions.__wrapped__()
-    assert cpu_vec_isa.valid_vec_isa_list() == []
-    assert len(searches) == 3
+    monkeypatch.setattr(cpu_vec_isa, "x86_isa_checker", lambda: ["avx2", "avx512", "amx_tile"])
+    kinds = [type(kind)() for kind in cpu_vec_isa.supported_vec_isa_list]  # torch remembers an answer
+    monkeypatch.setattr(cpu_vec_isa, "supported_vec_isa_list", kinds)
+    with torch_compile.trusted_vector_instructions():
+        usable = cpu_vec_isa.valid_vec_isa_list.__wrapped__()
+    assert [str(kind) for kind in usable] == ["avx512", "avx2"]
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_the_layout_of_a_stored_recording_is_taken_over_by_another_one(tmp_path, monkeypatch):

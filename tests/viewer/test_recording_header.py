@@ -594,7 +594,7 @@ def test_viewers_get_the_wall_every_two_seconds_and_the_file_does_not(run, monke
     perf_counter = SimpleNamespace(perf_counter=lambda: next(clock))  # other threads have the clock itself
     schedule = FrameSchedule(None, listener, episodes=1)
     monkeypatch.setattr("cprl.viewer.frames.time", perf_counter)
-    wall = Wall(viewer.env, listener, schedule, listener.scene, recorded_steps=100)
+    wall = Wall(viewer.env, listener, schedule, recorded_steps=100)
     for step in range(1, 10):
         listener.step = listener.turn = step
         wall.on_step(None)

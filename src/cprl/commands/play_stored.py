@@ -7,7 +7,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -300,10 +299,11 @@ def show_played(
 ) -> None:
     """Print what was played, as tables below a heading or as CSV rows; write the files, draw the figure."""
     from cprl.evaluation.populations import table_note
+    from cprl.runs.episodes import csv_text
     from cprl.terminal.text_tables import print_tables
 
     if files.csv:
-        _print_rows(table)
+        OUT.write(csv_text(table))
         return
     tables = list(cells)
     heading = table_note(table, "heading")
@@ -314,15 +314,6 @@ def show_played(
     files.write(table, tables, notes=[heading])
     if isinstance(files, ResultFiles) and files.figure is not None and draw is not None:
         say(f"Figure: {draw(files.figure, width=files.figure_width)}")
-
-
-def _print_rows(table: "pa.Table") -> None:
-    from pyarrow.csv import write_csv
-    from pyarrow.types import is_list
-
-    rows = BytesIO()
-    write_csv(table.select([field.name for field in table.schema if not is_list(field.type)]), rows)
-    OUT.write(rows.getvalue().decode())
 
 
 def paths_of(runs: Sequence[str] | Mapping[str, str]) -> Iterable[str]:

@@ -25,7 +25,8 @@ class Tables(NamedTuple):
     """A game as arrays and numbers for the compiled rules. Arrays are int32 unless stated otherwise.
 
     A cell is an index into the board with a rim of wall around it, counted row by row, with `stride` cells
-    per row. Numbers and switches without a docstring are the fields of `Rules` of the same name.
+    per row. Numbers and switches without a docstring have the meaning of the field of that name of `Rules`,
+    or of `Game.observation`.
     """
 
     background: Int32
@@ -66,12 +67,15 @@ class Tables(NamedTuple):
     stride: int
     """The number of cells per row, rim included."""
     beam_half_width: int
+    """The cells to each side of a beam's middle."""
     hits_to_tag: int
     freeze_steps: int
     episode_steps: int
     has_beam: bool
+    """Whether agents have the action "fire"."""
     agents_apart: bool
     one_hot: bool
+    """Whether observations have a channel for each class of cell."""
     highest: int
     """The largest value in an observation, 1 or 255, see `Game.observation_highest`."""
     score_begin: int
@@ -86,6 +90,7 @@ class Tables(NamedTuple):
     never_from_nothing: bool
     """Whether an empty board stays empty for ever, which ends an episode."""
     regrow_by_share: bool
+    """Whether growth goes by the share of near sites that hold an apple, not by their number."""
     regrow_under_agents: bool
     growth: int
     """The number of the word in `Rules.growth`, see `cprl.commons.apples`."""
@@ -102,7 +107,9 @@ class Tables(NamedTuple):
     end_below: int
     """An episode ends by chance after a turn if a uniform 32-bit word is below this threshold."""
     end_from_step: int
+    """`RandomEnd.from_step`, the first turn after which chance may end an episode."""
     end_every_steps: int
+    """`RandomEnd.every_steps`, the turns from one such chance to the next."""
     random_headings: bool
     respawn_at_spawns: bool
     clashes: int

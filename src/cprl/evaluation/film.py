@@ -131,7 +131,8 @@ DEFAULT_FPS: Final = 15.0
 MOST_FPS: Final = 50.0
 """The largest number of pictures per second: browsers slow down GIFs that are faster."""
 _GIF_FRAMES: Final = 300
-"""The largest number of pictures in a GIF, unless `Style.every` is given."""
+"""The largest number of pictures in a GIF before that of the last turn and the end card, unless `Style.every`
+is given."""
 _PALETTE_SAMPLES: Final = 24
 """The number of pictures from which a GIF's palette is taken."""
 Fps = Annotated[float, Where(lambda fps: 0 < fps <= MOST_FPS, f"a number above 0, at most {MOST_FPS:g}")]
@@ -145,7 +146,7 @@ class Style(Value, stored=False):
     """The title of each run; by default the institutions of the runs, or the names of their experiments."""
     every: Positive | None = None
     """The number of turns from one picture to the next; by default 1 for an .mp4, and for a .gif as many as
-    give at most `_GIF_FRAMES` pictures."""
+    give at most `_GIF_FRAMES` pictures, beside the last turn and the end card."""
     fps: Fps = DEFAULT_FPS
     """The pictures per second. In a .gif a picture lasts a whole number of hundredths of a second."""
     width: Positive | None = None

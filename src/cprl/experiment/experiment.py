@@ -90,8 +90,8 @@ class Experiment(Value, stored=False, called="experiment"):
     periods where they count steps; a `StockRule` or a `Constant`; or `Frozen`, which names it as the agent
     after the last of its run. None leaves the first option in force."""
     governor_from_step: Natural = 0
-    """The steps of each replica before the governor decides and learns; until then its first option is in
-    force, so that agents learn first."""
+    """The steps of each replica before the governor may decide and learn, so that agents learn first. It
+    begins with the next period that starts then; until that its first option is in force."""
     episodes: Positive | None = None
     """Episodes that each replica trains, in all its worlds together; None with `steps`."""
     steps: Annotated[int, Range(1, MOST_INT64)] | None = None

@@ -278,15 +278,16 @@ class Outcome:
         A tragedy in the sense of G. Hardin, "The tragedy of the commons" (1968): each of several has learned
         to take what pays, and what they share is ruined, so that all get less than if nobody had learned.
         That it is learned is why the peak is well above random play; that it is the ruin of a board, and no
-        mere fall, why boards have to die. The numbers are ours. Whether the difference is more than chance is
+        mere fall, why boards have to die. The numbers are ours; factors of a negative random play, as of
+        incomes without a harvest, are as far above or below it. Whether the difference is more than chance is
         another question, which intervals over replicas answer.
         """
-        if self.peak < LEARNED_FACTOR * self.random:
+        if self.peak < self.random + (LEARNED_FACTOR - 1) * abs(self.random):
             return NO_BETTER
         has_fallen = is_lost(self.low, peak=self.peak, random=self.random)
         if has_fallen and is_regained(self.last, peak=self.peak, low=self.low):
             return RECOVERY
-        if self.last <= BELOW_RANDOM_FACTOR * self.random:
+        if self.last <= self.random - (1 - BELOW_RANDOM_FACTOR) * abs(self.random):
             is_ruin = self.agents > 1 and self.lived <= LIVED_SHARE
             return TRAGEDY if is_ruin else DECLINE
         return DECLINE if is_lost(self.last, peak=self.peak, random=self.random) else HARVESTING

@@ -88,13 +88,13 @@ def governor_spaces(game: Game) -> Spaces:
 
 
 class GovernorActor(nn.Module):
-    """Decides for B worlds at once: in the first turn that it is asked, and every `Governor.every_steps`
-    turns.
+    """Decides for B worlds at once, in each turn whose number is a multiple of `Governor.every_steps`, the
+    first being 0.
 
     Args:
         governor: the governor that decides.
         by: how.
-        from_turn: the turns before the first decision; until then the first option is in force.
+        from_turn: the turn from which on it decides; until its first decision the first option is in force.
     """
 
     def __init__(self, governor: Governor, by: LaneActor | Script, *, from_turn: int = 0) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
+from pyarrow.csv import write_csv
 
 from cprl.measuring import Episode
 from cprl.measuring.registry import IN_FORCE_PREFIX, METRICS, SOCIAL_METRICS, TOTALS, left_out_note
@@ -364,6 +365,14 @@ def write_table(path: Path, table: pa.Table, *, over: bool = False) -> None:
         refuse_to_write_over(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, lambda file: write_small(table, file))
+
+
+def csv_text(table: pa.Table) -> str:
+    """Return a table as CSV, with the names of the columns and without those of lists."""
+    columns = [field.name for field in table.schema if not pa.types.is_list(field.type)]
+    file = BytesIO()
+    write_csv(table.select(columns), file)
+    return file.getvalue().decode()
 
 
 def write_small(table: pa.Table, file: BinaryIO) -> None:

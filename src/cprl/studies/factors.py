@@ -369,9 +369,9 @@ def factors_of(experiment: Experiment, flags: Iterable[str]) -> dict[str, Factor
         if path in factors:
             raise ValueError(f"--vary has {path} twice; allowed: once, with all its values")
         hints = _types_at(experiment, path)
-        distribution = _DRAWN.fullmatch(text)
+        distribution = _DRAWN.fullmatch(text.replace("_", ""))
         if distribution is not None:
-            kind = _BY_WORD[distribution[1].lower().replace("_", "")]
+            kind = _BY_WORD[distribution[1].lower()]
             factors[path] = kind(*(_literal(end.strip()) for end in distribution[2].split(",")))
         else:
             factors[path] = tuple(_value(piece, hints, path) for piece in pieces)
@@ -397,7 +397,7 @@ def _types_at(experiment: Experiment, path: str) -> list[Any]:
 _BETWEEN: Final = re.compile(r",(?![^(]*\))")
 """A comma outside of parentheses."""
 _BY_WORD: Final[Mapping[str, Any]] = {name.lower(): kind for name, kind in DISTRIBUTIONS.items()}
-_DRAWN: Final = re.compile(r"\s*(uniform|log_?uniform|integers)\(([^,]*,[^,]*)\)\s*", re.IGNORECASE)
+_DRAWN: Final = re.compile(rf"\s*({'|'.join(_BY_WORD)})\(([^,]*,[^,]*)\)\s*", re.IGNORECASE)
 _CONSTANTS: Final = {"true": True, "false": False, "none": None}
 
 

@@ -21,8 +21,8 @@ from cprl.system.compat.torch_compile import (
     every_guard,
     guards_hold,
     quiet_about_fallbacks,
-    remember_vector_instructions,
     sound_local_buffers,
+    trusted_vector_instructions,
     with_new_code,
     without_lookup,
 )
@@ -139,14 +139,19 @@ class Compiled:
 
     def _compile(self, function: FunctionType, arguments: Sequence[Any]) -> tuple[Any, bool]:
         """Compile and call; return the result, and whether torch can tell which arguments the code fits."""
-        remember_vector_instructions()
         for further in ({}, NO_GUARDS):
             options = {**COMPILE_OPTIONS, **further}  # a copy, since torch removes entries
             # Not dynamic: torch remembers sizes and numbers of other learners, and would make those of this
             # one variables of the code.
             self._compiled = torch.compile(function, fullgraph=True, dynamic=False, options=options)
             try:
-                with warnings.catch_warnings(), every_guard(), sound_local_buffers(), quiet_about_fallbacks():
+                with (
+                    warnings.catch_warnings(),
+                    every_guard(),
+                    sound_local_buffers(),
+                    trusted_vector_instructions(),
+                    quiet_about_fallbacks(),
+                ):
                     for kind in (DeprecationWarning, FutureWarning):  # raised inside torch and TorchRL
                         warnings.simplefilter("ignore", kind)
                     return self._compiled(*arguments), not further

@@ -57,7 +57,6 @@ from cprl.system.times import Times
 from cprl.system.waiting_room import experimental
 from cprl.system.working import working
 from cprl.terminal.course import NEEDED, course_of
-from cprl.terminal.figures import training_curve
 from cprl.terminal.progress import ProgressBar
 from cprl.terminal.summary import summarise
 from cprl.training.evaluating import (
@@ -398,6 +397,8 @@ def _evaluate(
 @working("drawing the training curve")
 def _draw_curve(run: _OpenRun, training: Training, evaluation: pa.Table) -> Path | None:
     """Draw the training curve, and return its file; None if a replica has ended no episode."""
+    from cprl.terminal.figures import training_curve  # takes half a second, for which no training waits
+
     if not all(training.episodes_by_replica):
         say(f"No training curve: a replica has ended no episode in {training.steps:,} steps")
         return None

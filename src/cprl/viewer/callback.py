@@ -204,7 +204,7 @@ class ViewerCallback:
             if scene.boards > 1:
                 recorded_episodes = header.episodes // scene.worlds // max(1, self.schedule.every) + 1
                 recorded_steps = commons.game.rules.episode_steps * recorded_episodes
-                yield Wall(commons, logger, self.schedule, scene, recorded_steps=recorded_steps)
+                yield Wall(commons, logger, self.schedule, recorded_steps=recorded_steps)
             samples = Samples(commons, logger)
             yield samples
         yield Pictures(logger, samples, every=picture_period)

@@ -216,10 +216,11 @@ class Wall(View):
         env: CommonsEnv,
         logger: RerunLogger,
         schedule: FrameSchedule,
-        scene: Scene,
         *,
         recorded_steps: int,
     ) -> None:
+        scene = logger.scene
+        assert scene is not None
         self._env = env
         self._logger = logger
         self._schedule = schedule

@@ -20,7 +20,6 @@ A factor whose path equals another column is called "factor PATH". Summaries and
 not the runs.
 """
 
-import io
 import json
 from collections import Counter
 from collections.abc import Mapping
@@ -32,11 +31,10 @@ from typing import Any, Final, Literal
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.csv
 import pyarrow.parquet as pq
 
 from cprl.measuring.table import WINDOWS, where
-from cprl.runs.episodes import write_table
+from cprl.runs.episodes import csv_text, write_table
 from cprl.runs.files import STUDY_TABLE_FORMAT, refuse_newer
 from cprl.runs.recipe import versions
 from cprl.system.defaults import LAST_EPISODES
@@ -264,9 +262,7 @@ class StudyTable:
 
     def to_csv(self) -> str:
         """Return the rows as CSV, with the names of the columns, e.g. for spreadsheets and R."""
-        file = io.BytesIO()
-        pyarrow.csv.write_csv(self.rows, file)
-        return file.getvalue().decode()
+        return csv_text(self.rows)
 
     @classmethod
     def read(cls, path: Path | str, *, last: int = LAST_EPISODES) -> "StudyTable":

@@ -3,9 +3,6 @@
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
-from functools import cache
-from hashlib import sha256
-from pathlib import Path
 from types import CodeType, FunctionType
 from typing import Any, Final
 from unittest.mock import patch
@@ -16,10 +13,15 @@ from cprl.system.libraries import relying_on, require
 
 require("torch", torch.compiler, "skip_all_guards_unsafe")
 
-COMPILE_OPTIONS: Final[Mapping[str, Any]] = {"cpp_wrapper": True, "cpp.threads": 1}
+COMPILE_OPTIONS: Final[Mapping[str, Any]] = {
+    "cpp_wrapper": True,
+    "cpp.threads": 1,
+    "cpp_cache_precompile_headers": False,
+}
 """Options of `torch.compile`. Compiled code runs in one thread; torch's threads, whatever their number, are
 for matrix products. With two threads in compiled code as well, a training was thirty times slower, presumably
-because the threads of two OpenMP runtimes block each other's cores while they wait."""
+because the threads of two OpenMP runtimes block each other's cores while they wait. To precompile headers
+takes five seconds of a processor and 140 MB for each set of options, and then saves nothing."""
 
 NO_GUARDS: Final[Mapping[str, Any]] = {"guard_filter_fn": torch.compiler.skip_all_guards_unsafe}
 """Further options, for functions whose guards torch itself finds broken; `guards_hold` must not be asked
@@ -130,34 +132,16 @@ def quiet_about_fallbacks() -> Iterator[None]:
         torch_log.removeFilter(says_more)
 
 
-@cache
-def remember_vector_instructions() -> None:
-    """Make torch detect usable vector instructions only once instead of in every process.
+def trusted_vector_instructions() -> AbstractContextManager[Any]:
+    """Make torch use the vector instructions of the CPU in a context, without asking its compiler.
 
-    Torch loads a library in a new process for each set of instructions, which takes two seconds. The result
-    is stored in torch's cache folder for this version of torch, compiler and CPU, if all sets of the CPU are
-    usable.
+    By default torch compiles a library for each set of instructions and loads it in a new process, which
+    takes eight seconds of a processor. All compilers that can read torch's headers know these sets, but for
+    AMX, which is left out: only products of matrices use it, and those are not compiled.
     """
-    with relying_on("torch", "torch._inductor.cpu_vec_isa and cpp_builder as they were"):
-        from torch._inductor import cpu_vec_isa  # takes a second
-        from torch._inductor.cpp_builder import get_compiler_version_info, get_cpp_compiler
-        from torch._inductor.runtime.cache_dir_utils import cache_dir
+    with relying_on("torch", "torch._inductor.cpu_vec_isa.VecISA.check_build"):
+        from torch._inductor.cpu_vec_isa import VecISA  # takes a second
 
-        find = cpu_vec_isa.valid_vec_isa_list
+        name = VecISA.check_build.__name__
 
-    @cache
-    def remembered() -> list[Any]:
-        has = cpu_vec_isa.x86_isa_checker()
-        kinds = cpu_vec_isa.supported_vec_isa_list
-        usable = [kind for kind in kinds if has and set(str(kind).split()) <= set(has)]
-        text = f"{torch.__version__} {get_compiler_version_info(get_cpp_compiler())} {has}"
-        mark = Path(cache_dir()) / f"usable_vectors_{sha256(text.encode()).hexdigest()[:16]}"
-        if usable and mark.exists():
-            return usable
-        types: list[Any] = find()
-        if usable and types == usable:
-            with suppress(OSError):
-                mark.touch()
-        return types
-
-    cpu_vec_isa.valid_vec_isa_list = remembered
+    return patch.object(VecISA, name, lambda kind, _: "amx" not in str(kind))
