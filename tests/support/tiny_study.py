@@ -32,6 +32,6 @@ FREEZE = "game.rules.freeze_steps"
 GAMMA = "agents.*.algorithm.settings.gamma"
 
 
-def study_of(factors, episodes=24, replicas=4):
-    """Conditions of replicas in blocks of two."""
-    return Study(replace(OFTEN_SAVED, episodes=episodes), factors, replicas=replicas, block=2)
+def study_of(factors, episodes=24):
+    """2 x 2 conditions of 4 replicas, in two blocks each."""
+    return Study(replace(OFTEN_SAVED, episodes=episodes), factors, replicas=4, block=2)
