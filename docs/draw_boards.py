@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.image import imsave
 
 from cprl import CommonsEnv, Game, Rules, maps, presets
-from cprl.terminal.style import FIGURE_STYLE
+from cprl.terminal.picture_files import FIGURE_STYLE
 
 FOLDER = Path(__file__).parent / "boards"
 SMALL_CELL_PIXELS = 12

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from cprl.terminal.style import MARK, MEAN, RAW, drawing
+from cprl.terminal.style import MARK_COLOUR, MEAN_COLOUR, RAW_COLOUR, drawing
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "recipes" / "study" / "theory"))
 
@@ -20,17 +20,17 @@ MANY: Final = np.unique(np.geomspace(1, 100, 60).round().astype(int))
 def draw_herders() -> None:
     """Draw what all gain against the animals that graze; animals and the price of anarchy by the herders."""
     with drawing(PATH) as sheet:
-        left, middle, right = sheet.panels(3, columns=3, high=23, width_ratios=(1.25, 1, 1))
+        left, middle, right = sheet.panels(3, columns=3, row_height_em=23, width_ratios=(1.25, 1, 1))
         one = herders(1)
         totals = np.linspace(0, 1.05 * one.open_access_total, 200)
-        left.plot(totals, [one.surplus(total) for total in totals], color=MEAN, linewidth=2)
-        left.axhline(0, color=RAW, linewidth=1)
+        left.plot(totals, [one.surplus(total) for total in totals], color=MEAN_COLOUR, linewidth=2)
+        left.axhline(0, color=RAW_COLOUR, linewidth=1)
         for name, at in (
             ("optimum", one.optimum_total),
             *((f"n = {herd}", herders(herd).nash_total) for herd in HERDS),
         ):
             is_best = name == "optimum"
-            colour = "black" if is_best else MARK
+            colour = "black" if is_best else MARK_COLOUR
             left.plot(at, one.surplus(at), "o", color=colour, markersize=6)
             above = {"xytext": (0, 6), "ha": "center"} if is_best else {"xytext": (6, 4), "ha": "left"}
             left.annotate(name, (at, one.surplus(at)), textcoords="offset points", **above)
@@ -40,16 +40,16 @@ def draw_herders() -> None:
         left.set_xlabel("animals A")
         games = [herders(int(herd)) for herd in MANY]
         middle.plot(
-            MANY, [game.nash_total for game in games], color=MARK, linewidth=2, label="equilibrium A*"
+            MANY, [game.nash_total for game in games], color=MARK_COLOUR, linewidth=2, label="equilibrium A*"
         )
         middle.plot(
             MANY, [game.optimum_total for game in games], color="black", linewidth=2, label="optimum A**"
         )
         access = one.open_access_total
-        middle.axhline(access, color=RAW, linestyle=":", linewidth=1.4, label="open access")
+        middle.axhline(access, color=RAW_COLOUR, linestyle=":", linewidth=1.4, label="open access")
         middle.set_ylim(0, 1.1 * access)
         middle.set_title("animals, by the number of herders")
-        right.plot(MANY, [game.price_of_anarchy for game in games], color=MARK, linewidth=2)
+        right.plot(MANY, [game.price_of_anarchy for game in games], color=MARK_COLOUR, linewidth=2)
         right.set_ylim(0, None)
         right.set_title("gain at the optimum over that in equilibrium")
         for panel in (middle, right):

@@ -15,7 +15,7 @@ from cprl.institutions import COUNT_NAMES, Institution
 from cprl.pictures.colours import agent_colour
 from cprl.pictures.image import world_image
 from cprl.policies.scripted import Plan, ScriptedActor, ScriptedPolicy
-from cprl.terminal.style import MARK, MEAN, RAW
+from cprl.terminal.style import MARK_COLOUR, MEAN_COLOUR, RAW_COLOUR
 
 SEED: Final = 3
 CELL: Final = 24
@@ -157,7 +157,7 @@ def pay_bars(panel: Axes, course: Course, title: str) -> None:
     panel.bar(names - 0.2, harvest, 0.36, color=[hue(i) for i in names], edgecolor=EDGE, label="harvest")
     panel.bar(names - 0.2, -paid, 0.36, color="white", edgecolor=EDGE, hatch="////", label="paid")
     panel.bar(names + 0.2, given, 0.36, color="white", edgecolor=EDGE, hatch="....", label="given")
-    panel.plot(names, income, "D", color=MARK, markersize=7, label="income")
+    panel.plot(names, income, "D", color=MARK_COLOUR, markersize=7, label="income")
     panel.axhline(0, color=EDGE, linewidth=0.8)
     panel.set_xticks(names, [f"agent {i}" for i in names])
     label(panel, title, y="apples")
@@ -166,6 +166,8 @@ def pay_bars(panel: Axes, course: Course, title: str) -> None:
 def stock_lines(panel: Axes, governed: Course, free: Course, name: str) -> None:
     """Draw the apples on the board with an institution and without."""
     turns = np.arange(1, len(governed.apples) + 1)
-    panel.plot(turns, free.apples.sum(1), color=RAW, linestyle="--", linewidth=2, label="no institution")
-    panel.plot(turns, governed.apples.sum(1), color=MEAN, linewidth=2, label=name)
+    panel.plot(
+        turns, free.apples.sum(1), color=RAW_COLOUR, linestyle="--", linewidth=2, label="no institution"
+    )
+    panel.plot(turns, governed.apples.sum(1), color=MEAN_COLOUR, linewidth=2, label=name)
     label(panel, "Apples on the board, four greedy agents", "turn", "apples")

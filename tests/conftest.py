@@ -99,7 +99,7 @@ def drawn(monkeypatch):
         figures.append(figure)
         return path
 
-    monkeypatch.setattr("cprl.terminal.style.save", keep)
+    monkeypatch.setattr("cprl.terminal.picture_files.save", keep)
     return figures
 
 

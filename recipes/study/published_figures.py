@@ -118,7 +118,7 @@ def _draw(result: Result, metric: str, limits: tuple[float, float], path: Path) 
             strips["ours"] = bands_of(phases)
     heights = [STRIP_EM * len(strips), PANEL_EM] if strips else [PANEL_EM]
     with style.drawing(path) as sheet:
-        *above, axes = sheet.panels(len(heights), high=heights, sharex=True)
+        *above, axes = sheet.panels(len(heights), row_height_em=heights, sharex=True)
         for first, last, name in strips.get("ours", ()):
             if name != UNNAMED:  # which is white, and hatched in the strip alone
                 axes.axvspan(first, last, **_look(name, "#e6e6e6"), zorder=0, linewidth=0)
@@ -168,7 +168,7 @@ def _draw_strip(sheet: style.Sheet, panel: Axes, axes: Axes, rows: Mapping[str, 
         for first, last, name in bands:
             names.add(name)
             panel.barh(row, last - first, left=first, height=0.9, **_look(name, "#777777"))
-            if style.CHARACTER * len(name) < (last - first) / (high - low) * (sheet.width_em - 8):
+            if style.CHARACTER_EM * len(name) < (last - first) / (high - low) * (sheet.width_em - 8):
                 box = {"facecolor": COLOURS[name], "edgecolor": "none", "pad": 1}
                 panel.text((first + last) / 2, row, name, ha="center", va="center", bbox=box)
     for name in filter(names.__contains__, COLOURS):
@@ -194,13 +194,13 @@ def _draw_curves(axes: Axes, smoothed: Float64, metric: str) -> None:
     """Draw each replica, [R, E], their mean and its interval; an agent's return in the agent's colour."""
     middle, low, high = curve_interval(smoothed)
     replicas = len(smoothed)
-    bold: dict[str, Any] = {"color": style.MEAN}
-    faint = style.REPLICA
+    bold: dict[str, Any] = {"color": style.MEAN_COLOUR}
+    faint = style.REPLICA_COLOUR
     wide = INTERVAL
     agent = metric.removeprefix("return_")
     if agent.isdecimal():
         bold = on_white(int(agent))
-        faint = wide = style.RAW
+        faint = wide = style.RAW_COLOUR
     marker = "." if len(middle) < 3 else None  # a line needs two points
     label = "ours, one replica"
     if replicas > 1:
@@ -216,9 +216,9 @@ def _draw_curves(axes: Axes, smoothed: Float64, metric: str) -> None:
 def _draw_published(axes: Axes, result: Result, metric: str) -> None:
     """Draw the published curve and random play."""
     if result.study:
-        look = {"color": style.PUBLISHED, "linewidth": 1.1, "zorder": 2.8}
+        look = {"color": style.PUBLISHED_COLOUR, "linewidth": 1.1, "zorder": 2.8}
         axes.plot(*result.study.curve(metric), label="published", **look)
     random = _random(result, metric)
     if random is not None:
         label = f"random play, ours, {random:,.4g} {unit(metric)}".strip()
-        axes.axhline(random, **style.RANDOM_LINE, label=label)
+        axes.axhline(random, **style.RANDOM_LINE_STYLE, label=label)

@@ -6,7 +6,7 @@ import pytest
 from PIL import Image
 from places import ROOT
 
-from cprl.terminal.style import FIGURE_STYLE
+from cprl.terminal.picture_files import FIGURE_STYLE
 
 SCREENSHOTS = {"docs/viewer.png", "docs/replay.png"}
 MEGABYTES = 30

@@ -30,7 +30,7 @@ from cprl.measuring.windows import running_mean
 from cprl.population import Learning, Scripted, Team, exploration_steps
 from cprl.runs.curves import episode_of_turn
 from cprl.runs.episodes import table_of
-from cprl.terminal import style
+from cprl.terminal import picture_files, style
 from cprl.terminal.figures import training_curve
 
 
@@ -111,7 +111,7 @@ def test_a_short_training_shows_its_peak_its_end_random_play_and_where_explorati
         assert words in told
     assert figure.caption == "Running means are over 10 episodes, centred."
     see_that_the_legend_is_whole(figure)
-    levels = [line for line in above.lines if line.get_color() == style.RANDOM_LINE["color"]]
+    levels = [line for line in above.lines if line.get_color() == style.RANDOM_LINE_STYLE["color"]]
     assert [(line.get_linestyle(), line.get_ydata()[0]) for line in levels] == [("--", 282.0)]
 
 
@@ -119,7 +119,7 @@ def test_a_centred_running_mean_stands_at_the_middle_of_its_episodes(tmp_path, d
     metrics = the_tragedy(1, 60)
     metrics["collective_return"] = np.arange(60.0)[None]
     training_curve(a_run(tmp_path / "run", metrics), title="a line")
-    bold = next(line for line in curves_panels(drawn[0])[0].lines if line.get_color() == style.MEAN)
+    bold = next(line for line in curves_panels(drawn[0])[0].lines if line.get_color() == style.MEAN_COLOUR)
     assert "highest and last mean of 3 episodes, 58 apples, episode 58" in labels(drawn[0])
     np.testing.assert_allclose(bold.get_xdata(), bold.get_ydata(), err_msg="a mean of a line lies on it")
     assert running_mean(np.arange(5.0), 2).tolist() == [0.5, 1.5, 2.5, 3.5]
@@ -177,7 +177,7 @@ def test_a_game_without_a_harvest_has_one_panel_and_an_agents_colour_has_an_edge
 def a_line(path, title="a line", name="a line", **look):
     """A figure of one line, and who drew it."""
     with style.drawing(path, **look) as sheet:
-        (axes,) = sheet.panels(1, high=12)
+        (axes,) = sheet.panels(1, row_height_em=12)
         axes.plot([1, 2], label=name)
         axes.set_xticks([0, 1], [name, "other"])
         sheet.title, sheet.caption = title, "Made up, here and now."
@@ -211,14 +211,14 @@ def test_the_suffix_says_what_is_written_the_same_each_time(tmp_path):
             contents.append((tmp_path / f"{name}{suffix}").read_bytes())
         assert contents[0].startswith(head)
         assert contents[0] == contents[1]
-    for path, look in (("a.jpg", {}), ("a.png", {"is_new": True}), ("b.png", {"width": "poster"})):
+    for path, look in (("a.jpg", {}), ("a.png", {"refuse_existing": True}), ("b.png", {"width": "poster"})):
         with pytest.raises((ValueError, FileExistsError), match=r"path is|a\.png|width is"):
             a_line(tmp_path / path, **look)
 
 
 def test_every_id_in_an_svg_stands_once(tmp_path):
     with style.drawing(tmp_path / "a.svg") as sheet:
-        for axes in sheet.panels(4, columns=2, high=10):
+        for axes in sheet.panels(4, columns=2, row_height_em=10):
             axes.plot([1, 2])
     ids = re.findall(r' id="([^"]*)"', (tmp_path / "a.svg").read_text())
     assert len(ids) == len(set(ids))
@@ -243,12 +243,13 @@ def test_a_training_curve_can_be_read_at_every_width(width, tmp_path, drawn):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("colours", [style.PNG_COLOURS, style.PNG_SHADES])
+@pytest.mark.parametrize("colours", [picture_files.PNG_COLOURS, picture_files.PNG_SHADES])
 def test_a_figure_of_few_colours_looks_like_one_with_all_in_half_the_room(colours, tmp_path):
     with style.drawing(tmp_path / "few.png", colours=colours) as sheet:
-        (axes,) = sheet.panels(1, high=24)
+        (axes,) = sheet.panels(1, row_height_em=24)
         sheet.figure.colorbar(axes.imshow(np.linspace(-1, 1, 900).reshape(30, 30), cmap="RdBu"))
-    style.save(sheet.figure, tmp_path / "few.png", colours=colours)  # the first one still moves the bar
+    # The first drawing still moves the bar.
+    picture_files.save(sheet.figure, tmp_path / "few.png", colours=colours)
     sheet.figure.savefig(tmp_path / "all.png")
     with Image.open(tmp_path / "few.png") as picture:
         assert len(picture.getcolors()) <= colours

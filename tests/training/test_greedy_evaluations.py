@@ -151,7 +151,9 @@ def test_evaluations_are_logged_recorded_and_drawn(tmp_path, monkeypatch):
     assert np.ravel(values) == pytest.approx(wanted)
     figures = []
     with monkeypatch.context() as patched:
-        patched.setattr("cprl.terminal.style.save", lambda figure, path, **how: figures.append(figure))
+        patched.setattr(
+            "cprl.terminal.picture_files.save", lambda figure, path, **how: figures.append(figure)
+        )
         training_curve(stored, title="evaluated")
     panel = next(axes for axes in figures[0].axes if axes.lines)
     (line,) = (line for line in panel.lines if line.get_label() == "greedy, evaluated while trained")

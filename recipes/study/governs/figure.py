@@ -63,7 +63,7 @@ def draw(path: Path, groups: Sequence[str]) -> None:
     names = [name for _, name in rows]
     with style.drawing(path) as sheet:
         income, equality = sheet.panels(
-            2, columns=2, high=1.7 * len(rows) + 6, sharey=True, width_ratios=(3, 1)
+            2, columns=2, row_height_em=1.7 * len(rows) + 6, sharey=True, width_ratios=(3, 1)
         )
         for group in groups:
             places = [place for place, row in enumerate(rows) if row[0] == group]
@@ -77,7 +77,7 @@ def draw(path: Path, groups: Sequence[str]) -> None:
             *(learning, range(len(names))),
             **{**LEFT_WHILE_LEARNING, "color": "#222222", "linestyle": "none", "label": "while learning"},
         )
-        income.axvline(random_income(), **style.RANDOM_LINE, label="random play")
+        income.axvline(random_income(), **style.RANDOM_LINE_STYLE, label="random play")
         income.set_yticks(range(len(names)), names)
         income.set_xscale("log")
         income.set_xticks(TICKS, [f"{apples:,}" for apples in TICKS])

@@ -56,15 +56,18 @@ def means(shares: Float64, numbers: Float64) -> Float64:
 def main(*, out: Path) -> None:
     """Play the governors, and draw what they set."""
     with style.drawing(out) as sheet:
-        panels = sheet.panels(2 * len(LEARNED), columns=2, high=11, sharey=True)
+        panels = sheet.panels(2 * len(LEARNED), columns=2, row_height_em=11, sharey=True)
         for row, condition in enumerate(LEARNED):
             for axes, of_replicas, what in zip(
                 panels[2 * row : 2 * row + 2], courses(condition), ("stock", "episode"), strict=True
             ):
-                axes.plot(TENTHS, of_replicas.T, color=style.REPLICA, linewidth=0.9, alpha=0.75)
+                axes.plot(TENTHS, of_replicas.T, color=style.REPLICA_COLOUR, linewidth=0.9, alpha=0.75)
                 everywhere = ~np.isnan(of_replicas).any(0)
                 axes.plot(
-                    TENTHS[everywhere], of_replicas[:, everywhere].mean(0), color=style.MEAN, linewidth=2.4
+                    TENTHS[everywhere],
+                    of_replicas[:, everywhere].mean(0),
+                    color=style.MEAN_COLOUR,
+                    linewidth=2.4,
                 )
                 axes.set_title(f"{condition}, by the {what}")
                 axes.set_xlabel(f"share of the {what}")

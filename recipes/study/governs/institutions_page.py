@@ -23,7 +23,7 @@ from cprl.measuring.statistics import Estimate, curve_interval, difference, esti
 from cprl.measuring.table import by_replica, where
 from cprl.terminal import style
 from cprl.terminal.panels import draw_dots, draw_line
-from cprl.terminal.style import RANDOM_LINE
+from cprl.terminal.style import RANDOM_LINE_STYLE
 from cprl.values.array_types import Float64, Int64
 
 STUDY: Final = "changes"
@@ -144,16 +144,16 @@ def random_play(outcomes: Outcomes) -> Estimate:
 def draw(outcomes: Outcomes, courses: pa.Table, path: Path) -> None:
     """Draw the income over the training under each institution, and frozen at its end, beside none."""
     with style.drawing(path) as sheet:
-        panels = sheet.panels(len(DRAWN), columns=4, high=15, sharex=True, sharey=True)
+        panels = sheet.panels(len(DRAWN), columns=4, row_height_em=15, sharex=True, sharey=True)
         for axes, name in zip(panels, DRAWN, strict=True):
-            for condition, colour, place in ((NOTHING, "#777777", 1.06), (name, style.MEAN, 1.12)):
+            for condition, colour, place in ((NOTHING, "#777777", 1.06), (name, style.MEAN_COLOUR, 1.12)):
                 label = "no institution" if condition == NOTHING else "with the institution"
                 steps, income = course(courses, condition)
                 thousands = steps / 1000
                 draw_line(axes, thousands, curve_interval(income), color=colour, label=label)
                 end = level(outcomes, condition, INCOME, FROZEN)
                 draw_dots(axes, [place * thousands[-1]], [end], color=colour)
-            axes.axhline(random_play(outcomes).value, **RANDOM_LINE, label="random play")
+            axes.axhline(random_play(outcomes).value, **RANDOM_LINE_STYLE, label="random play")
             axes.set_title(name)
         sheet.xlabel = "thousand steps"
         sheet.title = "Income under each institution, apples"

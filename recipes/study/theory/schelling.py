@@ -28,7 +28,7 @@ from cprl.measuring.statistics import estimate
 from cprl.policies.scripted import SCRIPTED_POLICIES
 from cprl.runs.recipe import RECIPE_FILE
 from cprl.system.output import say
-from cprl.terminal.style import check_picture
+from cprl.terminal.picture_files import check_picture
 
 BOARDS: Final = ("commons", "two_complex")
 RULES: Final = {
@@ -117,7 +117,7 @@ def main(
     for board, rules, greedy in diagrams(trained):
         agents = greedy if greedy in SCRIPTED_POLICIES else "trained"
         name = f"{board}_{rules}_{agents}".replace(",", "").replace(" ", "_")
-        figures[board, rules, greedy] = check_picture(out / f"{name}.png")
+        figures[board, rules, greedy] = check_picture(out / f"{name}.png", refuse_existing=True)
     out.mkdir(parents=True, exist_ok=True)
     rows = []
     for (board, rules, greedy), figure in figures.items():

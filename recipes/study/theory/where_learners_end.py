@@ -37,7 +37,7 @@ import cprl
 from cprl import keys
 from cprl.measuring.statistics import estimate
 from cprl.measuring.table import where
-from cprl.terminal.style import MARK, MEAN, RAW, drawing
+from cprl.terminal.style import MARK_COLOUR, MEAN_COLOUR, RAW_COLOUR, drawing
 from cprl.values.array_types import Float64
 
 GAMES: Final = (("herders", 2), ("herders", 5), ("appropriation", 8))
@@ -50,7 +50,7 @@ BLOCK: Final = 5
 """The episodes of a row."""
 LAST: Final = 0.2
 """The share of the training, at its end, that the table is about."""
-COLOURS: Final = {"individual": MEAN, "team": "#238b45"}
+COLOURS: Final = {"individual": MEAN_COLOUR, "team": "#238b45"}
 DASHES: Final = {"tables": "-", "PPO": (0, (4, 1.5))}
 
 Condition = Mapping[str, Any]
@@ -113,7 +113,7 @@ def curves_of(table: pa.Table, condition: Condition) -> dict[str, Float64]:
 def draw(table: pa.Table, path: Path) -> None:
     """Draw the total taken over the training, a panel for each game, with what theory says."""
     with drawing(path) as sheet:
-        panels = dict(zip(GAMES, sheet.panels(len(GAMES), high=24, sharex=True), strict=True))
+        panels = dict(zip(GAMES, sheet.panels(len(GAMES), row_height_em=24, sharex=True), strict=True))
         for (kind, herd), panel in panels.items():
             panel.set(title=f"{kind}, {herd} agents", ylabel="taken a turn, in all")
             _draw_theory(panel, sharing_of(kind, herd))
@@ -136,8 +136,8 @@ def draw(table: pa.Table, path: Path) -> None:
 
 def _draw_theory(panel: Axes, sharing: SharingGame) -> None:
     totals = {
-        "open access": (sharing.open_access_total, RAW, ":"),
-        "equilibrium": (sharing.nash_total, MARK, "--"),
+        "open access": (sharing.open_access_total, RAW_COLOUR, ":"),
+        "equilibrium": (sharing.nash_total, MARK_COLOUR, "--"),
         "optimum": (sharing.optimum_total, "black", "-."),
     }
     for name, (total, color, linestyle) in totals.items():

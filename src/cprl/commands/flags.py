@@ -170,9 +170,9 @@ class ResultFiles(TableFiles):
     def check(self, **beside: object) -> None:
         super().check(**beside)
         if self.figure is not None:
-            from cprl.terminal.style import check_picture
+            from cprl.terminal.picture_files import check_picture
 
-            check_picture(self.figure, "--figure")
+            check_picture(self.figure, "--figure", refuse_existing=True)
 
 
 TableFlags = Annotated[TableFiles, tyro.conf.arg(name="")]

@@ -33,7 +33,7 @@ from cprl.measuring.statistics import HOLM_NOTE, Family, differences, estimates
 from cprl.measuring.table import BACKGROUND, BOTH, FOCAL, ROLE, all_metrics, labelled, where
 from cprl.system.defaults import Diagonal, Fresh
 from cprl.system.working import working
-from cprl.terminal import style
+from cprl.terminal import picture_files, style
 from cprl.terminal.panels import draw_matrix, matrix_height
 from cprl.terminal.summary import is_empty_row, rewards_of
 from cprl.terminal.text_tables import TextTable
@@ -195,8 +195,8 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
     unit = f", {rewards}" if rewards else ""
     diagonal_word = table_note(table, "diagonal").replace("_", "-")
     rows, columns = (dict(zip(labels, labels, strict=True)) for labels in matrix_labels(gain_estimates))
-    with style.drawing(path, width=width, colours=style.PNG_SHADES) as sheet:
-        panels = sheet.panels(len(_GAINS), high=matrix_height(len(rows)))
+    with style.drawing(path, width=width, colours=picture_files.PNG_SHADES) as sheet:
+        panels = sheet.panels(len(_GAINS), row_height_em=matrix_height(len(rows)))
         for axes, (metric, panel_title) in zip(panels, _GAINS.items(), strict=True):
             values = {}
             texts = dict(self_play)

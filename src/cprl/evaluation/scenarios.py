@@ -343,8 +343,8 @@ def scenario_tables(table: pa.Table) -> Iterator[TextTable]:
 
 
 _LOOKS: Final = {
-    (RUN_AGENTS, FOCAL_RETURN): ("o", style.MEAN, "focal agents: the run's"),
-    ("greedy", FOCAL_RETURN): ("s", style.MARK, "greedy in their place"),
+    (RUN_AGENTS, FOCAL_RETURN): ("o", style.MEAN_COLOUR, "focal agents: the run's"),
+    ("greedy", FOCAL_RETURN): ("s", style.MARK_COLOUR, "greedy in their place"),
     ("random", FOCAL_RETURN): ("D", "#8a8a8a", "random in their place"),
     (RUN_AGENTS, BACKGROUND_RETURN): ("|", "#000000", "background agents, beside the run's"),
 }
@@ -364,7 +364,7 @@ def draw_scenarios(table: pa.Table, path: Path | str, *, width: style.Width = "p
     names = list(dict.fromkeys(scenario for scenario, _ in levels.labels))
     rows = np.arange(len(names))
     with style.drawing(path, width=width) as sheet:
-        (axes,) = sheet.panels(1, high=_ROW_EM * len(rows) + 4)
+        (axes,) = sheet.panels(1, row_height_em=_ROW_EM * len(rows) + 4)
         for index, ((focal, metric), (marker, colour, label)) in enumerate(_LOOKS.items()):
             means = [levels[name, focal, metric] for name in names]
             positions = list(rows + _RESULT_SPACING * (index - (len(_LOOKS) - 1) / 2))

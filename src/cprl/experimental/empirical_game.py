@@ -56,7 +56,7 @@ from cprl.measuring.statistics import (
 from cprl.measuring.table import FOCAL, ROLE, by_replica
 from cprl.system.defaults import EGTA_RESAMPLES, Fresh
 from cprl.system.working import note_progress, working
-from cprl.terminal import style
+from cprl.terminal import picture_files, style
 from cprl.terminal.panels import draw_line, draw_matrix, matrix_height
 from cprl.terminal.text_tables import TextTable
 from cprl.values import Range, checked
@@ -401,11 +401,11 @@ def draw_egta(analysis: Analysis, path: Path | str, *, width: style.Width = "pag
     at_home = np.diagonal(analysis.pairs, axis1=1, axis2=2).mean(0)
     texts |= {(name, name): f"{mean:.3g}" for name, mean in zip(names, at_home, strict=True)}
     draw_dynamics = {2: _draw_line, 3: _draw_simplex}.get(len(names))
-    with style.drawing(path, width=width, colours=style.PNG_SHADES, is_new=True) as sheet:
-        columns = sheet.fitting(2, 24)
+    with style.drawing(path, width=width, colours=picture_files.PNG_SHADES, refuse_existing=True) as sheet:
+        columns = sheet.columns_that_fit(2, 24)
         ratios: Any = {"width_ratios": (1.35, 1)} if columns == 2 else {}
         heights = [matrix_height(len(names))] * (3 - columns) + [_DYNAMICS_HIGH] * bool(draw_dynamics)
-        panels = sheet.panels(2 + bool(draw_dynamics), columns=columns, high=heights, **ratios)
+        panels = sheet.panels(2 + bool(draw_dynamics), columns=columns, row_height_em=heights, **ratios)
         matrix, rank = panels[:2]
         if draw_dynamics:
             draw_dynamics(panels[2], analysis)
@@ -428,13 +428,13 @@ def draw_egta(analysis: Analysis, path: Path | str, *, width: style.Width = "pag
 def _draw_ranks(axes: Axes, analysis: Analysis) -> None:
     """Draw each run's share by alpha-rank, and the most frequent end of replicator dynamics."""
     places = np.arange(len(analysis.names))
-    axes.barh(places, [share.value for share in analysis.shares], color=style.REPLICA, height=0.6)
+    axes.barh(places, [share.value for share in analysis.shares], color=style.REPLICA_COLOUR, height=0.6)
     low = [share.low for share in analysis.shares]
     high = [share.high for share in analysis.shares]
-    axes.hlines(places, low, high, color=style.PUBLISHED)
+    axes.hlines(places, low, high, color=style.PUBLISHED_COLOUR)
     if len(analysis.ends.mixtures):
         label = f"end of replicator dynamics, from {analysis.ends.shares[0]:.0%} of the starts"
-        axes.plot(analysis.ends.mixtures[0], places, "D", color=style.MARK, label=label, clip_on=False)
+        axes.plot(analysis.ends.mixtures[0], places, "D", color=style.MARK_COLOUR, label=label, clip_on=False)
     axes.set_yticks(places, [style.wrapped(name, 9) for name in analysis.names])
     axes.set(xlim=(0, 1), ylim=(len(places) - 0.5, -0.5), xlabel="share of the agents in the long run")
     axes.set_title("alpha-rank, infinite alpha")
@@ -449,11 +449,13 @@ def _draw_line(axes: Axes, analysis: Analysis) -> None:
         curves.append([np.subtract(*game.against([share, 1 - share])) for share in shares])
     middle, low, high = curve_interval(curves)
     draw_line(axes, shares, (middle, low, high))
-    axes.axhline(0, color=style.RAW, lw=1, zorder=1)
+    axes.axhline(0, color=style.RAW_COLOUR, lw=1, zorder=1)
     for at, is_stable in _fixed_points(shares, middle):
-        face = style.MARK if is_stable else "white"
-        axes.plot(at, 0, "o", markersize=8, color=style.MARK, markerfacecolor=face, clip_on=False, zorder=4)
-    arrow = {"arrowstyle": "->", "color": style.MARK}
+        face = style.MARK_COLOUR if is_stable else "white"
+        axes.plot(
+            at, 0, "o", markersize=8, color=style.MARK_COLOUR, markerfacecolor=face, clip_on=False, zorder=4
+        )
+    arrow = {"arrowstyle": "->", "color": style.MARK_COLOUR}
     for start in (0.12, 0.37, 0.62, 0.87):
         ahead = 0.03 if np.interp(start, shares, middle) > 0 else -0.03
         axes.annotate("", (start + ahead, 0), (start - ahead, 0), arrowprops=arrow)
@@ -475,7 +477,7 @@ def _fixed_points(shares: Float64, gains: Float64) -> list[tuple[float, bool]]:
 
 def _draw_simplex(axes: Axes, analysis: Analysis) -> None:
     """Draw the dynamics of the shares of three runs in a triangle, with their ends."""
-    axes.plot(*np.vstack([_CORNERS, _CORNERS[:1]]).T, color=style.RAW, lw=1)
+    axes.plot(*np.vstack([_CORNERS, _CORNERS[:1]]).T, color=style.RAW_COLOUR, lw=1)
     mixtures = (compositions(_GRID - 3, 3) + 1) / _GRID
     moves = np.array([replicator(analysis.mean.normalised, mixture) for mixture in mixtures]) @ _CORNERS
     lengths = np.linalg.norm(moves, axis=1, keepdims=True)
@@ -485,7 +487,7 @@ def _draw_simplex(axes: Axes, analysis: Analysis) -> None:
     )
     for mixture, share in zip(analysis.ends.mixtures, analysis.ends.shares, strict=True):
         at = mixture @ _CORNERS
-        axes.plot(*at, "o", color=style.MARK, markersize=9, zorder=4)
+        axes.plot(*at, "o", color=style.MARK_COLOUR, markersize=9, zorder=4)
         offset = (9, -9) if at[1] > _CORNERS[:, 1].max() - 0.1 else (8, 8)  # not over the name of the top
         axes.annotate(f"{share:.0%}", at, offset, textcoords="offset points")
     for corner, name in zip(_CORNERS, analysis.names, strict=True):

@@ -26,7 +26,8 @@ from cprl.studies.tables.comparing import (
 )
 from cprl.studies.tables.tidy_table import StudyDesign, StudyTable
 from cprl.terminal.panels import draw_cells, draw_matrix, width_of_cells
-from cprl.terminal.style import EMPTY, PNG_SHADES, Width, drawing, wrapped
+from cprl.terminal.picture_files import PNG_SHADES
+from cprl.terminal.style import EMPTY_COLOUR, Width, drawing, wrapped
 from cprl.values import refusal
 
 ENDINGS: Final = {
@@ -124,8 +125,8 @@ def heat_map(
     if shown_differences:
         maps.append(_map_of_differences(grid, shown_differences, table.design.reference))
     with drawing(path, width=width, colours=PNG_SHADES) as sheet:
-        side_by_side = sheet.fitting(len(maps), 5.5 * len(grid.columns) + 12)
-        panels = sheet.panels(len(maps), columns=side_by_side, high=_CELL_EM * len(grid.rows) + 8)
+        side_by_side = sheet.columns_that_fit(len(maps), 5.5 * len(grid.columns) + 12)
+        panels = sheet.panels(len(maps), columns=side_by_side, row_height_em=_CELL_EM * len(grid.rows) + 8)
         for axes, content in zip(panels, maps, strict=True):
             draw_matrix(
                 sheet,
@@ -217,12 +218,12 @@ def phase_diagram(
     """
     grid = _grid_of(table, factors)
     with drawing(path, width=width) as sheet:
-        (axes,) = sheet.panels(1, high=_CELL_EM * len(grid.rows) + 6)
+        (axes,) = sheet.panels(1, row_height_em=_CELL_EM * len(grid.rows) + 6)
         cell_width = width_of_cells(sheet, grid.rows, grid.columns)
         cells = {}
         for pair, name in grid.conditions.items():
             counts = table.endings.get(name)
-            cells[pair] = EMPTY, "no run"
+            cells[pair] = EMPTY_COLOUR, "no run"
             if counts:
                 word, number = next(iter(counts.items()))
                 text = f"{wrapped(word, cell_width)}\n{number} of {sum(counts.values())}"

@@ -244,8 +244,8 @@ def draw_schelling(table: pa.Table, path: Path | str, *, width: style.Width = "p
     payoffs = payoffs_of(table)
     possible = candidates(margins(payoffs.cooperators, payoffs.defectors))
     agents = payoffs.cooperators.shape[1]
-    with style.drawing(path, width=width, is_new=True) as sheet:
-        single, group = sheet.panels(2, columns=sheet.fitting(2, 24), high=20)
+    with style.drawing(path, width=width, refuse_existing=True) as sheet:
+        single, group = sheet.panels(2, columns=sheet.columns_that_fit(2, 24), row_height_em=20)
         for (name, (colour, marker)), returns in zip(_LOOKS.items(), payoffs, strict=False):
             player = Path(table_note(table, name)).name
             label = name if player == name else f"{name}: {player}"

@@ -32,7 +32,7 @@ from cprl.measuring.table import labelled, where
 from cprl.pictures.colours import PALETTE, agent_colour
 from cprl.system.defaults import Fresh
 from cprl.system.working import working
-from cprl.terminal import style
+from cprl.terminal import picture_files, style
 from cprl.terminal.text_tables import TextTable
 from cprl.training.stored import LoadedRun, as_loaded
 from cprl.values import checked, refusal
@@ -177,10 +177,10 @@ def draw_visits(
     hues = np.stack([_rgb(agent_colour(agent)) for agent in range(len(shares))])
     alone = np.divide(longest, total, out=np.zeros_like(total), where=total > 0)
     light = DARKEST + (1 - DARKEST) * np.sqrt(longest / max(longest.max(), 1e-12)) * alone
-    with style.drawing(path, width=width, colours=style.PNG_SHADES, is_new=True) as sheet:
-        columns = sheet.fitting(min(_COLUMNS, len(shares) + 1), 16)
+    with style.drawing(path, width=width, colours=picture_files.PNG_SHADES, refuse_existing=True) as sheet:
+        columns = sheet.columns_that_fit(min(_COLUMNS, len(shares) + 1), 16)
         high = sheet.width_em / columns * board.height / board.width + 2
-        whole, *panels = sheet.panels(len(shares) + 1, columns=columns, high=high)
+        whole, *panels = sheet.panels(len(shares) + 1, columns=columns, row_height_em=high)
         _show(whole, board, hues[owner], np.where(owner >= 0, light, 0.0), "who spends most time where")
         for agent, panel in enumerate(panels):
             title = f"agent {agent}, tagged {tagged[agent]:,} times"

@@ -42,10 +42,10 @@ from cprl.studies.tables.tidy_table import RANDOM_PART, TRAINING_PART, StudyTabl
 from cprl.system.waiting_room import experimental
 from cprl.terminal.panels import draw_dots, draw_line
 from cprl.terminal.style import (
-    CHARACTER,
+    CHARACTER_EM,
     DASHES,
-    MEAN,
-    RANDOM_LINE,
+    MEAN_COLOUR,
+    RANDOM_LINE_STYLE,
     Sheet,
     Width,
     drawing,
@@ -155,8 +155,8 @@ def by_factor(
     means = condition_means(table, chosen)
     layout = _factor_layout(table, factor)
     with drawing(path, width=width) as sheet:
-        columns = sheet.fitting(min(len(chosen), 3), 16)
-        panels = sheet.panels(len(chosen), columns=columns, high=19, sharex=True)
+        columns = sheet.columns_that_fit(min(len(chosen), 3), 16)
+        panels = sheet.panels(len(chosen), columns=columns, row_height_em=19, sharex=True)
         for axes, metric in zip(panels, chosen, strict=True):
             _draw_factor_panel(axes, table, layout, metric, means)
             bottom, top = axes.get_ylim()
@@ -234,7 +234,7 @@ def _draw_factor_panel(
             linestyle=linestyle,
         )
         if shows_random:
-            look = {**RANDOM_LINE, "marker": "_", "markersize": 9}
+            look = {**RANDOM_LINE_STYLE, "marker": "_", "markersize": 9}
             if not is_same:
                 look["color"] = layout.colours[label]
             if not is_joined:
@@ -242,7 +242,7 @@ def _draw_factor_panel(
             dashes = [random_play.get(name, nan) for name in names]
             axes.plot([place_of[name] for name in names], dashes, **look)
     if shows_random:
-        axes.plot([], [], label=RANDOM_LABEL, **RANDOM_LINE)
+        axes.plot([], [], label=RANDOM_LABEL, **RANDOM_LINE_STYLE)
 
 
 def _is_same_at_each_place(random_play: Mapping[str, float], at: Mapping[str, float]) -> bool:
@@ -365,7 +365,7 @@ def by_condition(
             if is_levels:
                 _draw_random_play(axes, conditions, _random_play(table, metric))
             else:
-                axes.axvline(0, **RANDOM_LINE)
+                axes.axvline(0, **RANDOM_LINE_STYLE)
                 if axes.dataLim.width < _NO_WIDTH:
                     axes.set_xlim(-1, 1)
             axes.set_title(metric_title(metric, levels))
@@ -385,9 +385,9 @@ def _row_panels(sheet: Sheet, labels: Sequence[str], number: int) -> list[Axes]:
     names = [wrapped(label, min(_NAME_WIDTH, 0.3 * sheet.width_em)) for label in labels]
     lines = [name.splitlines() for name in names]
     high = (_LINE_HEIGHT * max(map(len, lines)) + 0.8) * len(names) + 7
-    beside = CHARACTER * max(len(line) for name in lines for line in name)
-    columns = sheet.fitting(number, 12.5)
-    panels = sheet.panels(number, columns=columns, high=high, beside=beside, sharey=True)
+    beside = CHARACTER_EM * max(len(line) for name in lines for line in name)
+    columns = sheet.columns_that_fit(number, 12.5)
+    panels = sheet.panels(number, columns=columns, row_height_em=high, row_names_em=beside, sharey=True)
     for axes in panels:
         axes.set_yticks(range(len(names)), names)
         axes.locator_params(axis="x", nbins=3)
@@ -398,7 +398,7 @@ def _row_panels(sheet: Sheet, labels: Sequence[str], number: int) -> list[Axes]:
 
 def _draw_random_play(axes: Axes, conditions: Sequence[str], random_play: Mapping[str, float]) -> None:
     """Draw a dash for random play in the rows of the conditions that have it."""
-    look = {**RANDOM_LINE, "linestyle": (0, (2, 1))}
+    look = {**RANDOM_LINE_STYLE, "linestyle": (0, (2, 1))}
     for place, name in enumerate(conditions):
         if name in random_play:
             axes.plot([random_play[name]] * 2, [place - 0.42, place + 0.42], **look)
@@ -449,9 +449,11 @@ def courses(
     windows: set[int] = set()
     is_dashed = factor is None or not is_numeric(design.levels(factor))
     with drawing(path, width=width) as sheet:
-        columns = 1 if is_together else sheet.fitting(4, 14)
+        columns = 1 if is_together else sheet.columns_that_fit(4, 14)
         high = 21 if is_together else 15
-        panels = sheet.panels(len(contents), columns=columns, high=high, sharex=True, sharey=not is_together)
+        panels = sheet.panels(
+            len(contents), columns=columns, row_height_em=high, sharex=True, sharey=not is_together
+        )
         for axes, content in zip(panels, contents, strict=True):
             windows |= _draw_courses(axes, table, content.metric, content.lines, is_dashed=is_dashed)
             _draw_random_lines(axes, _random_play(table, content.metric), content.lines)
@@ -505,7 +507,7 @@ def _course_panels(
     beside = {}
     if reference in conditions:
         beside[reference] = _Line("#777777", f"reference: {labels[reference]}")
-    alone = _Line(MEAN, "the condition of the panel")
+    alone = _Line(MEAN_COLOUR, "the condition of the panel")
     return [
         _CoursePanel(labels[name], metrics[0], {**beside, name: alone})
         for name in conditions
@@ -519,9 +521,9 @@ def _draw_random_lines(axes: Axes, random_play: Mapping[str, float], lines: Mapp
     is_same = are_one_number(values.values())
     for name, value in list(values.items())[: 1 if is_same else None]:
         look = {} if is_same else {"color": lines[name].colour, "linewidth": 1.0}
-        axes.axhline(value, **{**RANDOM_LINE, **look})
+        axes.axhline(value, **{**RANDOM_LINE_STYLE, **look})
     if values:
-        axes.plot([], [], **RANDOM_LINE, label=RANDOM_LABEL)
+        axes.plot([], [], **RANDOM_LINE_STYLE, label=RANDOM_LABEL)
 
 
 def _draw_courses(

@@ -14,7 +14,7 @@ from cprl.measuring.windows import episodes_per_world, mean_of_worlds, smoothed_
 from cprl.runs.curves import as_curves, curve_worlds, episode_of_turn
 from cprl.runs.episodes import read_episodes, read_evaluations
 from cprl.terminal import style
-from cprl.terminal.style import MARK, Width
+from cprl.terminal.style import MARK_COLOUR, Width
 from cprl.values.array_types import Float64
 
 _HEIGHTS_EM: Final = (24, 13, 12, 12)
@@ -67,7 +67,7 @@ def training_curve(
     evaluations = read_evaluations(run)
     evaluations = None if evaluations is None else complete(evaluations)
     with style.drawing(path, width=width) as sheet:
-        panels = sheet.panels(len(metrics), high=_HEIGHTS_EM[: len(metrics)], sharex=True)
+        panels = sheet.panels(len(metrics), row_height_em=_HEIGHTS_EM[: len(metrics)], sharex=True)
         for axes, metric in zip(panels, metrics, strict=True):
             values = curves[metric]
             replicas = zip(values, worlds, strict=True)
@@ -79,7 +79,7 @@ def training_curve(
             _draw_evaluations(axes, evaluations, metric)
             if metric in random_means:
                 label = f"random play, {random_label}"
-                axes.axhline(random_means[metric], **style.RANDOM_LINE, label=label)
+                axes.axhline(random_means[metric], **style.RANDOM_LINE_STYLE, label=label)
             if metric == metrics[0]:
                 _mark_peak(axes, metric, *running, averaged_episodes)
             axes.set(xlim=(-0.5, max(length - 0.5, 1)), ylabel=with_unit(metric))
@@ -128,12 +128,14 @@ def _draw(axes: Axes, values: Float64, middle: Float64, means: Float64) -> None:
     dot = "." if length < 3 else None  # a line needs two points
     has_replicas = replicas > 1
     label = "each episode, mean of the replicas" if has_replicas else "each episode"
-    axes.plot(values.mean(0), color=style.RAW, linewidth=0.7, marker=dot, label=label, zorder=1.5)
+    axes.plot(values.mean(0), color=style.RAW_COLOUR, linewidth=0.7, marker=dot, label=label, zorder=1.5)
     if has_replicas:
-        lines = axes.plot(middle, means.T, color=style.REPLICA, linewidth=0.9, alpha=0.75, zorder=2)
+        lines = axes.plot(middle, means.T, color=style.REPLICA_COLOUR, linewidth=0.9, alpha=0.75, zorder=2)
         lines[0].set_label("each replica, running mean")
     label = f"mean of the {replicas} replicas, running mean" if has_replicas else "running mean"
-    axes.plot(middle, means.mean(0), color=style.MEAN, linewidth=2.4, marker=dot, label=label, zorder=3)
+    axes.plot(
+        middle, means.mean(0), color=style.MEAN_COLOUR, linewidth=2.4, marker=dot, label=label, zorder=3
+    )
 
 
 def _draw_evaluations(axes: Axes, evaluations: pa.Table | None, name: str) -> None:
@@ -144,7 +146,7 @@ def _draw_evaluations(axes: Axes, evaluations: pa.Table | None, name: str) -> No
     rows = rows.sort_by("trained_episodes")
     last_episode = rows["trained_episodes"].to_numpy() - 1.0  # episodes are counted from 0
     label = "greedy, evaluated while trained"
-    axes.plot(last_episode, rows["value_mean"].to_numpy(), **style.EVALUATED, label=label, zorder=3.5)
+    axes.plot(last_episode, rows["value_mean"].to_numpy(), **style.EVALUATED_STYLE, label=label, zorder=3.5)
 
 
 def _mark_peak(axes: Axes, name: str, middle: Float64, means: Float64, averaged_episodes: int) -> None:
@@ -159,7 +161,7 @@ def _mark_peak(axes: Axes, name: str, middle: Float64, means: Float64, averaged_
     for adjective, (point, marker) in marks.items():
         episode_words = f", episode {middle[point]:,.0f}" if point == highest else ""
         label = f"{adjective} {point_words}, {_amount(name, mean[point])}{episode_words}"
-        axes.plot(middle[point], mean[point], marker, **style.POINT, label=label, zorder=4)
+        axes.plot(middle[point], mean[point], marker, **style.POINT_STYLE, label=label, zorder=4)
 
 
 def mark_exploration(panels: Sequence[Axes], episode: float | None) -> None:
@@ -168,6 +170,6 @@ def mark_exploration(panels: Sequence[Axes], episode: float | None) -> None:
         return
     label = f"exploration ends, episode {episode:,.0f}"
     for panel in panels:
-        panel.axvline(episode, color=MARK, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
+        panel.axvline(episode, color=MARK_COLOUR, linewidth=1, linestyle=(0, (1, 2)), zorder=1)
         at_axis: dict[str, Any] = {"transform": panel.get_xaxis_transform(), "clip_on": False}
-        panel.plot(episode, 0, "^", markersize=9, color=MARK, zorder=5, label=label, **at_axis)
+        panel.plot(episode, 0, "^", markersize=9, color=MARK_COLOUR, zorder=5, label=label, **at_axis)

@@ -11,7 +11,7 @@ from matplotlib.patches import Rectangle
 from numpy.typing import ArrayLike
 
 from cprl.measuring.statistics import Estimate
-from cprl.terminal.style import CHARACTER, EMPTY, MEAN, Sheet, wrapped
+from cprl.terminal.style import CHARACTER_EM, EMPTY_COLOUR, MEAN_COLOUR, Sheet, wrapped
 from cprl.values.array_types import Float64
 
 _BAND_OPACITY: Final = 0.2
@@ -35,7 +35,12 @@ Pair = tuple[Any, Any]
 
 
 def draw_line(
-    axes: Axes, x: ArrayLike, curve: tuple[Float64, Float64, Float64], *, color: str = MEAN, **look: Any
+    axes: Axes,
+    x: ArrayLike,
+    curve: tuple[Float64, Float64, Float64],
+    *,
+    color: str = MEAN_COLOUR,
+    **look: Any,
 ) -> None:
     """Draw the line of a mean, with its interval as a band.
 
@@ -56,7 +61,7 @@ def draw_dots(
     *,
     replicas: Sequence[Sequence[float]] = (),
     across: bool = False,
-    color: str = MEAN,
+    color: str = MEAN_COLOUR,
     **look: Any,
 ) -> None:
     """Draw means as dots with their intervals.
@@ -123,7 +128,7 @@ def draw_matrix(
     is_small = width_of_cells(sheet, rows, columns, share=share) < _CELL_WIDE_EM
     cells = {}
     for pair, text in texts.items():
-        colour = shades(scale(values[pair])) if pair in values else EMPTY
+        colour = shades(scale(values[pair])) if pair in values else EMPTY_COLOUR
         cells[pair] = colour, "*" * text.endswith("*") if is_small else text
     draw_cells(sheet, axes, rows, columns, cells, share=share, upward=upward)
     axes.figure.colorbar(ScalarMappable(scale, colours), ax=axes)
@@ -180,7 +185,7 @@ def _row_names(sheet: Sheet, rows: Mapping[Any, str], share: float) -> list[str]
 
 def _longest(names: Sequence[str]) -> float:
     """Return the width of the longest line of all names, in em."""
-    return CHARACTER * max(len(line) for name in names for line in name.splitlines())
+    return CHARACTER_EM * max(len(line) for name in names for line in name.splitlines())
 
 
 def matrix_height(rows: int) -> float:
