@@ -1,5 +1,7 @@
 """What the tests share: small boards that are never square, and a quiet, seeded torch."""
 
+import gc
+import inspect
 import os
 import signal
 from dataclasses import replace
@@ -14,6 +16,9 @@ from cprl.algorithms import DQN
 from cprl.population import Learning, Scripted
 from cprl.system.jit.compiled import PLAIN_RULES, RULES_VARIABLE
 from cprl.values import METRIC_WORDS, trusting
+
+RUN_DEFAULTS = inspect.unwrap(cprl.run).__kwdefaults__
+DRAWS_CURVES = RUN_DEFAULTS["figures"]
 
 
 def pytest_addoption(parser):
@@ -30,6 +35,16 @@ def pytest_configure(config):
     os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [*folders, os.environ.get("PYTHONPATH", "")]))
     if config.getoption("--plain"):
         os.environ[RULES_VARIABLE] = PLAIN_RULES
+    # The curve of a small training takes longer than the training; tests that look at it ask for `curves`.
+    RUN_DEFAULTS["figures"] = False
+    # What tests write need not survive a crash of the machine.
+    os.fsync = lambda file: None
+
+
+def pytest_collection_finish():
+    # Each training ends with a garbage collection, which need not look at all that the tests have imported.
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True)
@@ -51,6 +66,12 @@ def names_of_metrics():
     """What a test, or code of the docs that it runs, calls a metric of its own is forgotten after it."""
     yield
     METRIC_WORDS.clear()
+
+
+@pytest.fixture
+def curves(monkeypatch):
+    """Trainings draw their curve, as they do for users."""
+    monkeypatch.setitem(RUN_DEFAULTS, "figures", DRAWS_CURVES)
 
 
 @pytest.fixture

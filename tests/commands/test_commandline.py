@@ -480,7 +480,7 @@ def test_a_module_of_ones_own_comes_before_that_of_the_recipes(elsewhere):
 
 
 @pytest.mark.integration
-def test_a_recipe_is_run_by_its_name_with_its_own_flags(elsewhere, monkeypatch, capsys):
+def test_a_recipe_is_run_by_its_name_with_its_own_flags(elsewhere, monkeypatch, capsys, curves):
     call(monkeypatch, f"run two_complex --variant as_run --no-beam {SHORT} --out run")
     experiment = cprl.load("run").experiment
     assert experiment.name == "two_complex_no_beam"

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from contextlib import ExitStack
+from itertools import takewhile
 from pathlib import Path
 
 import pytest
@@ -56,8 +57,9 @@ if __name__ == "__main__":
 
 @pytest.fixture(autouse=True)
 def here(tmp_path, monkeypatch):
-    """A working directory with a recipe."""
+    """A working directory with a recipe; figures of studies, which tests/studies looks at, are left out."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("cprl.studies.results.draw_figures", lambda table, out: [])
     monkeypatch.setattr(sys, "path", [*sys.path])
     Path("mine.py").write_text(RECIPE)
     return tmp_path
@@ -89,7 +91,7 @@ def test_a_recipe_is_run_under_every_combination_and_the_same_line_does_nothing_
 
 @pytest.mark.integration
 def test_the_end_of_the_training_that_is_compared_may_be_longer():
-    line = f"mine.py --vary {FREEZE}=2,5 --episodes 30 --out here"
+    line = f"mine.py --vary {FREEZE}=2,5 --turns 5 --episodes 20 --out here"
     for last in (10, 20):
         sweep(f"{line} --last {last}")
         summary = Path("here/summary.md").read_text()
@@ -168,7 +170,7 @@ def test_a_failed_condition_does_not_end_the_study_and_is_listed_with_what_tries
 
 @pytest.mark.integration
 def test_a_study_whose_runs_lost_their_content_says_so_and_what_to_do(capsys):
-    line = f"mine.py --vary {FREEZE}=5,2 --episodes 10 --out here"
+    line = f"mine.py --vary {FREEZE}=5,2 --turns 5 --episodes 10 --out here"
     sweep(line)
     first, second = (trial.directory for trial in trials_of(read_study("here"), "here/runs"))
     (first / "episodes.parquet").write_bytes(b"PAR1")
@@ -392,40 +394,45 @@ def test_a_study_that_is_interrupted_says_what_is_kept_and_how_to_continue(numbe
 
 
 BESIDE = """
+import json
 import sys
-sys.path[:0] = {paths!r}
 import cprl
 from tiny_study import FREEZE, TINY
-out, *levels = sys.argv[1:]
-study = cprl.Study(TINY, {{FREEZE: [int(level) for level in levels]}}, name="short")
-cprl.run_study(study, out, results=False)
+for line in sys.stdin:
+    study = cprl.Study(TINY, {FREEZE: json.loads(line)}, name="short")
+    try:
+        cprl.run_study(study, sys.argv[1], results=False)
+    except Exception as error:
+        print(f"{type(error).__name__}: {error}")
+    print("ended", flush=True)
 """
 
 
 @pytest.mark.integration
 def test_the_same_study_is_shared_and_another_one_is_refused_while_anybody_runs_it(tmp_path, capsys):
     out = tmp_path / "out"
-
-    def beside(*levels):
-        code = BESIDE.format(paths=[str(ROOT / "src"), str(SUPPORT)])
-        command = [sys.executable, "-c", code, str(out), *map(str, levels)]
-        return subprocess.run(command, capture_output=True, text=True, timeout=100)
-
     study = Study(TINY, {FREEZE: [2, 5]}, name="short")
-    with ExitStack() as stack:
-        stack.enter_context(driven(study, out))
-        assert capsys.readouterr().out == ""
-        before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
-        refused = beside(2, 9)
-        assert refused.returncode == 1
-        assert f"RunLockedError: {out} is run as another study by process {os.getpid()} on" in refused.stderr
-        assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
-        shared = beside(2, 5)
-        assert f"is run by somebody else too, process {os.getpid()} on" in shared.stdout
-        assert "2 of 2 trials finished" in shared.stdout
-        stack.enter_context(driven(study, out))
-        assert "is run by somebody else too" in capsys.readouterr().out
-    assert beside(2, 9).returncode == 0, "nobody runs it now"
+    command = [sys.executable, "-c", BESIDE, str(out)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+
+        def beside(*levels):
+            print(json.dumps(levels), file=process.stdin, flush=True)
+            return "".join(takewhile(lambda line: line != "ended\n", process.stdout))
+
+        with ExitStack() as stack:
+            stack.enter_context(driven(study, out))
+            assert capsys.readouterr().out == ""
+            before = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
+            refusal = f"RunLockedError: {out} is run as another study by process {os.getpid()} on"
+            assert beside(2, 9).startswith(refusal)
+            assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == before
+            said = beside(2, 5)
+            assert f"is run by somebody else too, process {os.getpid()} on" in said
+            assert "2 of 2 trials finished" in said
+            stack.enter_context(driven(study, out))
+            assert "is run by somebody else too" in capsys.readouterr().out
+        assert "2 of 2 trials finished" in beside(2, 9), "nobody runs it now"
+    assert process.returncode == 0
     assert not (out / "run.lock").exists()
 
 

@@ -140,7 +140,7 @@ def test_learning_agents_train_in_it(tmp_path):
         evaluation_episodes=2,
         engine="eager",
     )
-    run = cprl.run(experiment, tmp_path / "run", watch="off", figures=False)
+    run = cprl.run(experiment, tmp_path / "run", watch="off")
     assert set(read_episodes(run).column_names) >= {
         "rounds_survived",
         "has_survived",

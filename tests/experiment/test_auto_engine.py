@@ -171,7 +171,7 @@ def test_own_settings_that_say_nothing_count_turns(monkeypatch):
 @pytest.mark.integration
 def test_the_engine_is_said_where_a_training_begins_that_learns_and_what_is_assumed(tmp_path, capsys):
     def said(experiment, out, **options):
-        cprl.run(experiment, tmp_path / out, watch="off", figures=False, **options)
+        cprl.run(experiment, tmp_path / out, watch="off", **options)
         return [line for line in capsys.readouterr().out.splitlines() if line.startswith("Trains ")]
 
     assert said(replace(SHORT, agents=(Scripted("greedy"),) * 2), "scripted") == []

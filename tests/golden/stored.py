@@ -1,6 +1,6 @@
 """What stored runs do in fresh worlds: evaluated, mixed, among named backgrounds, and where they go.
 
-python tests/golden/stored.py KIND FOLDER      writes what that kind of evaluation gave to found.json
+python tests/golden/stored.py KIND ... FOLDER      writes what these kinds of evaluation gave to found.json
 """
 
 import json
@@ -110,6 +110,6 @@ def responses() -> dict[str, object]:
 KINDS = {kind.__name__: kind for kind in (evaluated, crossed, schelling, scenarios, territory, responses)}
 
 if __name__ == "__main__":
-    kind, folder = sys.argv[1:]
-    found = {f"{kind}: {name}": case for name, case in KINDS[kind]().items()}
+    *kinds, folder = sys.argv[1:]
+    found = {f"{kind}: {name}": case for kind in kinds for name, case in KINDS[kind]().items()}
     Path(folder, "found.json").write_text(json.dumps(found))

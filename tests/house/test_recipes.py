@@ -155,7 +155,7 @@ LANES = {"single_basic": 1, "single_complex": 1, "two_complex": 2, "two_against_
         for variant in presets.VARIANTS
     ],
 )
-def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, capsys):
+def test_recipes_of_replicas_leave_a_run_directory(name, variant, tmp_path, capsys, curves):
     options = {"episodes": 3, "evaluation_episodes": 2, "seed": 3}
     run = run_recipe(name, tmp_path / "run", own={"variant": variant}, **options)
     told = capsys.readouterr().out
@@ -370,7 +370,7 @@ def test_the_run_of_a_plain_agent_is_loaded_too_or_says_which_file_cannot_be_rea
 
 
 @pytest.mark.integration
-def test_the_tragedy_ends_with_what_happened_and_what_to_try_next(tmp_path, capsys, monkeypatch):
+def test_the_tragedy_ends_with_what_happened_and_what_to_try_next(tmp_path, capsys, curves):
     own = recipe("tragedy")
     words = ["recipes/tragedy.py", "--out", str(tmp_path / "run"), "--engine", "eager", "--watch", "off"]
     words += ["--episodes", "12", "--replicas", "2", "--evaluation-episodes", "2"]

@@ -409,7 +409,7 @@ def written(table):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     out = tmp_path_factory.mktemp("many") / "run"
-    return cprl.run(experiment(), out, figures=False)
+    return cprl.run(experiment(), out)
 
 
 @pytest.mark.integration
@@ -437,10 +437,10 @@ def test_a_run_has_a_row_for_each_episode_of_each_replica_with_its_world(finishe
 )
 def test_a_run_that_is_extended_equals_one_that_was_begun_as_long(short, whole, tmp_path):
     """Also where more episodes end in the last turn than were asked for."""
-    longer = cprl.run(experiment(**whole), tmp_path / "whole", watch="off", figures=False)
-    run = cprl.run(experiment(**short), tmp_path / "run", watch="off", figures=False, keep_checkpoint=True)
+    longer = cprl.run(experiment(**whole), tmp_path / "whole", watch="off")
+    run = cprl.run(experiment(**short), tmp_path / "run", watch="off", keep_checkpoint=True)
     before = rows_of(run)
-    cprl.run(experiment(**whole), run, resume=True, watch="off", figures=False)
+    cprl.run(experiment(**whole), run, resume=True, watch="off")
     assert written(rows_of(run)) == written(rows_of(longer))
     assert before.num_rows < rows_of(run).num_rows
     for path in ("evaluation/trained.parquet", "evaluation/random.parquet"):
@@ -462,7 +462,7 @@ def test_a_study_varies_worlds_and_its_table_counts_the_steps_of_replicas(tmp_pa
 
 
 @pytest.mark.integration
-def test_steps_in_which_no_episode_ends_make_a_finished_run_and_a_table_says_so(tmp_path, capsys):
+def test_steps_in_which_no_episode_ends_make_a_finished_run_and_a_table_says_so(tmp_path, capsys, curves):
     run = cprl.run(experiment(steps=30), tmp_path / "run", watch="off")
     assert "No training curve: a replica has ended no episode in 30 steps" in capsys.readouterr().out
     assert json.loads((run / "report.json").read_text())["episodes"] == [0, 0]
@@ -513,7 +513,7 @@ def test_numbers_of_many_worlds_are_means_over_the_episodes_of_each_in_turn():
 def test_several_threads_change_the_last_bits_at_most(tmp_path):
     alike = {"replicas": 1, "steps": 120, "engine": "compiled"}
     runs = [
-        cprl.run(experiment(**alike), tmp_path / f"{threads}", threads=threads, watch="off", figures=False)
+        cprl.run(experiment(**alike), tmp_path / f"{threads}", threads=threads, watch="off")
         for threads in (1, 2)
     ]
     one, two = (

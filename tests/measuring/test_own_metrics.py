@@ -35,7 +35,7 @@ def experiment(*targets, **changes):
 
 
 def train(measured, out, **options):
-    return cprl.run(measured, out, figures=False, **options)
+    return cprl.run(measured, out, **options)
 
 
 @pytest.fixture(scope="module")

@@ -168,7 +168,7 @@ def test_a_network_whose_module_is_not_there_is_missed_by_name_and_not_its_weigh
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    path = run(FIELD, tmp_path_factory.mktemp("whole") / "run")
+    path = run(FIELD, tmp_path_factory.mktemp("whole") / "run", figures=True)
     table = read_episodes(path).to_pydict()
     steps = [0, 0]
     for replica, played in zip(table["replica"], table["steps"], strict=True):
@@ -201,7 +201,9 @@ SLOW = ("save_beside_weights", "training_curve", "write_json", "summarise")
     "stage",
     ["save_weights", "evaluate_population", *(pytest.param(stage, marks=pytest.mark.slow) for stage in SLOW)],
 )
-def test_a_run_interrupted_in_any_stage_is_finished_by_resuming_it(stage, whole, tmp_path, monkeypatch):
+def test_a_run_interrupted_in_any_stage_is_finished_by_resuming_it(
+    stage, whole, tmp_path, monkeypatch, curves
+):
     with monkeypatch.context() as patched:
         patched.setattr(running, stage, interrupted)
         with pytest.raises(InterruptionError) as ended:

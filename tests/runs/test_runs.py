@@ -125,7 +125,7 @@ def test_a_run_in_a_directory_of_any_name_is_trained_resumed_by_its_line_exporte
     assert (started / "report.json").exists()
     exported = export_results(started, Path(f"{name} exported"))
     among = replace(TINY, agents=(TINY.agents[0], Frozen(os.fspath(exported), 0)))
-    loaded = cprl.load(cprl.run(among, Path(f"{name} among"), watch="off", figures=False))
+    loaded = cprl.load(cprl.run(among, Path(f"{name} among"), watch="off"))
     assert loaded.agent(1).network is not None
     assert len(cprl.evaluate_run(exported, cprl.Fresh(episodes=1)))
     assert record_episode(started, Path("film.rrd"), replica=0, episode=0)[0].exists()

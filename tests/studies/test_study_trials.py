@@ -373,7 +373,7 @@ def test_loading_evaluating_and_resuming_warn_of_other_code_and_the_recipe_keeps
     experiment = replace(TINY, callbacks=(Custom(target),))
     text = "class Callback:\n    is_extendable = True\n    def on_episode(self, episode, learning): ...\n"
     write_module(text)
-    run = cprl.run(experiment, tmp_path / "run", watch="off", figures=False, keep_checkpoint=True)
+    run = cprl.run(experiment, tmp_path / "run", watch="off", keep_checkpoint=True)
     cprl.trust(target)
     cprl.load(run)
     assert "own_callback" not in capsys.readouterr().err
@@ -381,7 +381,7 @@ def test_loading_evaluating_and_resuming_warn_of_other_code_and_the_recipe_keeps
     for use in (
         lambda: cprl.load(run),
         lambda: cprl.evaluate_run(run, cprl.Fresh(episodes=1)),
-        lambda: cprl.run(replace(experiment, episodes=3), run, resume=True, watch="off", figures=False),
+        lambda: cprl.run(replace(experiment, episodes=3), run, resume=True, watch="off"),
     ):
         use()
         assert "own_callback" in capsys.readouterr().err

@@ -26,7 +26,7 @@ TINY = Experiment(
     engine="eager",
 )
 MIXED = replace(TINY, agents=(LEARNING, Scripted("greedy")))
-OFTEN_SAVED = replace(TINY, episodes=60, callbacks=(Custom("often_saved:OftenSaved"),))
+OFTEN_SAVED = replace(TINY, episodes=24, callbacks=(Custom("often_saved:OftenSaved"),))
 
 FREEZE = "game.rules.freeze_steps"
 GAMMA = "agents.*.algorithm.settings.gamma"

@@ -1,6 +1,7 @@
 """Figures: everything drawn is in the legend, which lies beside the data."""
 
 import re
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,6 +18,7 @@ from matplotlib.text import Text
 from PIL import Image
 from published import published_experiment
 from published_figures import on_white
+from random_play import random_returns
 from results import Result
 from written_episodes import an_episode
 
@@ -30,6 +32,12 @@ from cprl.runs.curves import episode_of_turn
 from cprl.runs.episodes import table_of
 from cprl.terminal import style
 from cprl.terminal.figures import training_curve
+
+
+@pytest.fixture(autouse=True)
+def little_random_play(monkeypatch):
+    """Its mean is a line of the figures, which is not looked at."""
+    monkeypatch.setattr(reported, "random_returns", partial(random_returns, episodes=10))
 
 
 def a_run(folder, metrics):
@@ -307,7 +315,7 @@ def test_one_replica_has_no_interval_and_an_experiment_of_ones_own_no_published_
     see_that_the_legend_is_whole(drawn[0])
 
 
-def test_a_run_marks_where_the_exploration_of_its_agents_ends(tmp_path, drawn):
+def test_a_run_marks_where_the_exploration_of_its_agents_ends(tmp_path, drawn, curves):
     settings = DQNSettings(epsilon_hold_steps=3, epsilon_decay_steps=12, learning_starts=2, hidden_cells=(2,))
     experiment = cprl.Experiment(
         name="meadow",

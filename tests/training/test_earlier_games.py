@@ -211,9 +211,7 @@ def whole(tmp_path_factory):
     def trained_once(experiment):
         name = type(experiment.agents[0].algorithm).__name__ + experiment.engine
         if name not in runs:
-            runs[name] = cprl.run(
-                experiment, tmp_path_factory.mktemp(name) / "run", watch="off", figures=False
-            )
+            runs[name] = cprl.run(experiment, tmp_path_factory.mktemp(name) / "run", watch="off")
         return runs[name]
 
     return trained_once
@@ -228,7 +226,7 @@ def test_a_training_resumes_exactly_on_either_side_of_the_change(
     experiment = replace(STOPPING, agents=(Learning(algorithm),) * 2)
     expected = whole(experiment)
     run = stopped(at_step, experiment, tmp_path / "run")
-    cprl.run(experiment, run, resume=True, watch="off", figures=False)
+    cprl.run(experiment, run, resume=True, watch="off")
     assert_same_training(run, expected)
     assert f"step {2 * at_step}" in capsys.readouterr().out
     assert len(read_episodes(run)) == 2 * 2 * 2 * (2 + 5)
@@ -245,7 +243,7 @@ def test_episodes_of_a_game_without_an_institution_have_its_columns(tmp_path):
     for name, order in {"first": games, "last": games[::-1]}.items():
         parts = tuple(EarlierGame(game=game, steps=100) for game in order[:2])
         experiment = replace(CHANGING, game=order[2], earlier=parts)
-        run = cprl.run(experiment, tmp_path / name, watch="off", figures=False)
+        run = cprl.run(experiment, tmp_path / name, watch="off")
         rows = read_episodes(run)
         fines = rows["institutions/fines"].to_numpy()
         by_game = np.array_split(fines, 3)
@@ -266,7 +264,7 @@ def bounded():
 @pytest.mark.parametrize("before", [bounded(), bounded], ids=["value", "function"])
 def test_a_recording_shows_the_board_that_is_played(before, tmp_path):
     parts = (EarlierGame(game=before, steps=100),)
-    run = cprl.run(replace(CHANGING, game=TINY.game, earlier=parts), tmp_path / "run", figures=False)
+    run = cprl.run(replace(CHANGING, game=TINY.game, earlier=parts), tmp_path / "run")
     file = run / "run.rrd"
     steps, boards = column(file, "world/board", "SegmentationImage:buffer")
     pictures = {step: np.array(board[0]).reshape(6, 9) for step, board in zip(steps, boards, strict=True)}
@@ -286,9 +284,9 @@ def test_a_recording_shows_the_board_that_is_played(before, tmp_path):
 def test_transforms_carry_on_and_evaluations_share_them(stopped, tmp_path):
     fatigue = Custom("own_parts:Fatigue", arguments={"per_step": 0.01})
     experiment = replace(STOPPING, transforms=(fatigue,), evaluate_every=2)
-    whole = cprl.run(experiment, tmp_path / "whole", watch="off", figures=False)
+    whole = cprl.run(experiment, tmp_path / "whole", watch="off")
     run = stopped(60, experiment, tmp_path / "run")
-    cprl.run(experiment, run, resume=True, watch="off", figures=False)
+    cprl.run(experiment, run, resume=True, watch="off")
     assert_same_training(run, whole)
     assert is_same(*(read_evaluations(made).to_pydict() for made in (run, whole)))
     for made in (run, whole):

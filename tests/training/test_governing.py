@@ -33,7 +33,7 @@ BY_DQN = Learning(DQN(settings=DQNSettings(hidden_cells=(4,), learning_starts=4,
 EXPERIMENT = replace(
     TINY, game=GOVERNED, agents=(LEARNING, LEARNING), worlds=2, episodes=None, steps=80, replicas=2
 )
-QUIET = {"watch": "off", "figures": False}
+QUIET = {"watch": "off"}
 
 
 def training_of(experiment, *callbacks):

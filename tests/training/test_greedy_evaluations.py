@@ -50,7 +50,7 @@ def experiment(**changes):
 
 
 def run(experiment, out, **options):
-    return cprl.run(experiment, out, **{"watch": "off", "figures": False, "keep_checkpoint": True, **options})
+    return cprl.run(experiment, out, **{"watch": "off", "keep_checkpoint": True, **options})
 
 
 def rows(table):

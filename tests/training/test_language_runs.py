@@ -119,7 +119,7 @@ def test_messages_are_what_they_were_after_a_stop_and_without_a_network_and_no_p
         mute = replace(language(server.url, model=SCRIPT), instructions="You never listen.")
         agents = (replace(mute, instructions="", every_steps=7),) * 3 + (mute,)
         fields = {"game": TALK, "agents": agents, "episodes": 2, "replicas": 1}
-        quiet = {"watch": "off", "figures": False}
+        quiet = {"watch": "off"}
         run = cprl.run(experiment(None, **fields), tmp_path / "run", **quiet)
         prompts = [request["messages"][1]["content"] for request in server.requests]
         assert any(f'Agent 3 says: "{SCRIPT} ' in prompt for prompt in prompts)
@@ -151,9 +151,9 @@ def test_language_agents_are_filmed_and_shown_and_play_in_cross_play(tmp_path):
     with served() as server:
         fields = {"episodes": 1, "replicas": 1}
         runs = [tmp_path / name for name in ("planners", "greedy")]
-        cprl.run(experiment(language(server.url), **fields), runs[0], watch="off", figures=False)
+        cprl.run(experiment(language(server.url), **fields), runs[0], watch="off")
         scripts = experiment(None, agents=(Scripted("greedy"),) * 4, **fields)
-        cprl.run(scripts, runs[1], watch="off", figures=False)
+        cprl.run(scripts, runs[1], watch="off")
         asked = len(server.requests)
         _, (filmed,) = film_episode(runs[0], tmp_path / "film.gif", style=Style(width=240, fps=10))
         assert len(server.requests) > asked
@@ -201,7 +201,7 @@ def test_a_stored_run_is_evaluated_exported_frozen_and_described(finished, tmp_p
     frozen = [Frozen(os.path.relpath(copy), agent, 0) for agent in range(3)]
     mixed = experiment(spec, agents=(*frozen, Scripted("greedy")), episodes=1, replicas=1)
     with pytest.raises(ConnectionError, match=spec.base_url):
-        cprl.run(mixed, tmp_path / "mixed", watch="off", figures=False)
+        cprl.run(mixed, tmp_path / "mixed", watch="off")
 
 
 @pytest.mark.integration
@@ -222,8 +222,6 @@ def test_calls_of_a_frozen_language_agent_are_kept_in_the_run_in_which_it_is_fro
 def test_learning_agents_learn_beside_language_agents(tmp_path):
     with served() as server:
         agents = (Learning(ALGORITHMS["DQN"]), *(language(server.url),) * 2, Scripted("greedy"))
-        run = cprl.run(
-            experiment(None, agents=agents, episodes=2), tmp_path / "run", watch="off", figures=False
-        )
+        run = cprl.run(experiment(None, agents=agents, episodes=2), tmp_path / "run", watch="off")
         assert len(server.requests) >= 2 * 2 * (2 + 2)
     assert len(cprl.load(run).networks) == 2

@@ -258,27 +258,27 @@ FULL = Pool(
 def test_a_training_against_a_pool_is_stopped_and_resumed_bit_for_bit(learner, steps, tmp_path, stopped):
     changes = {"learner": learner, "evaluate_every": 4, "callbacks": (Custom("own_parts:Stopping"),)}
     pooled = experiment(FULL, **changes)
-    whole = cprl.run(pooled, tmp_path / "whole", watch="off", figures=False)
+    whole = cprl.run(pooled, tmp_path / "whole", watch="off")
     for step in steps:
         run = tmp_path / f"stopped_{step}"
-        stopped(step, pooled, run, figures=False)
+        stopped(step, pooled, run)
         assert checkpoints_in(run / "checkpoints")
-        cprl.run(pooled, run, resume=True, watch="off", figures=False)
+        cprl.run(pooled, run, resume=True, watch="off")
         assert_same_training(run, whole)
         assert differences(run, whole) == []
 
 
 @pytest.mark.integration
 def test_a_longer_training_continues_bit_for_bit(tmp_path):
-    whole = cprl.run(experiment(FULL, episodes=16), tmp_path / "whole", watch="off", figures=False)
-    longer = cprl.run(experiment(FULL), tmp_path / "longer", watch="off", figures=False, keep_checkpoint=True)
-    cprl.run(experiment(FULL, episodes=16), longer, resume=True, watch="off", figures=False)
+    whole = cprl.run(experiment(FULL, episodes=16), tmp_path / "whole", watch="off")
+    longer = cprl.run(experiment(FULL), tmp_path / "longer", watch="off", keep_checkpoint=True)
+    cprl.run(experiment(FULL, episodes=16), longer, resume=True, watch="off")
     assert_same_training(longer, whole)
 
 
 @pytest.mark.integration
 def test_a_stored_pool_is_loaded_evaluated_crossed_exported_and_frozen(tmp_path, stopped):
-    run = cprl.run(experiment(FULL), "pooled", watch="off", figures=False)
+    run = cprl.run(experiment(FULL), "pooled", watch="off")
     loaded = cprl.load(run)
     assert loaded.experiment == experiment(FULL)
     assert loaded.replicas == [0, 1]
@@ -292,14 +292,12 @@ def test_a_stored_pool_is_loaded_evaluated_crossed_exported_and_frozen(tmp_path,
     assert loaded.env(2).rollout(5, loaded.policy(1, worlds=2))["agents", "action"].shape == (2, 5, 4)
     exported = cprl.load(export_results(run, Path("deep/exported")))
     assert len(exported.agent(1).pool) == 5
-    again = cprl.run(
-        replace(experiment(Frozen("pooled", 1)), name="again"), "again", watch="off", figures=False
-    )
+    again = cprl.run(replace(experiment(Frozen("pooled", 1)), name="again"), "again", watch="off")
     assert len(cprl.load(again).agent(1).pool) == 5
     assert partners_in([FULL]) == ["earlier"]
     assert set(json.loads((run / "recipe.json").read_text())["frozen"]) == {"../earlier"}
     pooled = experiment(FULL, callbacks=(Custom("own_parts:Stopping"),))
-    running = stopped(35, pooled, tmp_path / "running", figures=False)
+    running = stopped(35, pooled, tmp_path / "running")
     cprl.trust("own_parts:Stopping")
     assert len(cprl.load(running).agent(1).pool) == 5, "of a checkpoint"
 

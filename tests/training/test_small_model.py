@@ -37,10 +37,10 @@ def test_a_small_model_is_asked_stored_and_replayed(tmp_path):
     fields = {"episodes": 1, "replicas": 1, "evaluation_episodes": 1}
     with served(answer) as server:
         spec = language(server.url, every_steps=25, max_tokens=40, fallback="random")
-        run = cprl.run(experiment(spec, **fields), tmp_path / "run", watch="off", figures=False)
+        run = cprl.run(experiment(spec, **fields), tmp_path / "run", watch="off")
     calls = read_calls(run / CALLS)
     assert len(calls) == 8
     assert all(call["answer"] for call in calls.values()), "it says something"
-    again = cprl.run(experiment(offline(run, spec), **fields), tmp_path / "again", watch="off", figures=False)
+    again = cprl.run(experiment(offline(run, spec), **fields), tmp_path / "again", watch="off")
     assert_same_training(run, again)
     assert read_calls(again / CALLS) == calls

@@ -44,7 +44,7 @@ def measured():
 
 
 def train(experiment, out, **options):
-    return cprl.run(experiment, out, watch="off", figures=False, **options)
+    return cprl.run(experiment, out, watch="off", **options)
 
 
 @pytest.fixture

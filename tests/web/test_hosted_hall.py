@@ -208,7 +208,7 @@ def test_the_governor_of_the_run_that_is_hosted_governs_people(tmp_path, monkeyp
         evaluation_episodes=2,
     )
     monkeypatch.chdir(tmp_path)
-    cprl.run(experiment, "trained", watch="off", figures=False)
+    cprl.run(experiment, "trained", watch="off")
     rounds = (("governed", GOVERNED), ("none", ()))
     plan = session(game="trained", rounds=rounds, turns=TURNS, seed=9)
     with hosted(tmp_path / "out", plan, monkeypatch) as hall:
