@@ -8,7 +8,8 @@ import pytest
 from places import GOLDEN, RESULTS
 from told_courses import SIXTEEN_WORLDS
 
-from cprl.measuring.outcome import Course, Outcome, outcome_of
+from cprl.measuring.live_label import Course
+from cprl.measuring.outcome import Outcome, outcome_of
 from cprl.measuring.series import Recent
 from cprl.measuring.table import complete, where
 from cprl.runs.curves import as_curves
@@ -137,7 +138,14 @@ def test_noise_around_random_play_is_neither_rise_nor_fall():
 )
 def test_negative_incomes_are_better_above_random_play_and_worse_below_it(peak, last, expected):
     outcome = Outcome(
-        begins=-100, peak=peak, around=10, low=last, last=last, lived=0.5, random=-100.0, agents=4
+        first_mean=-100,
+        peak=peak,
+        peak_episode=10,
+        lowest_after_peak=last,
+        last_mean=last,
+        life_share=0.5,
+        random_mean=-100.0,
+        agents=4,
     )
     assert outcome.word == expected
 
@@ -172,7 +180,9 @@ def test_stored_runs_go_and_went_as_they_did(run):
 def test_agents_explore_while_an_epsilon_falls_or_is_high(epsilons, expected):
     course, seen = Course(), []
     for epsilon in epsilons:
-        seen.append(course.explore({} if epsilon is None else {"agent_0": epsilon, "agent_1": float("nan")}))
+        seen.append(
+            course.note_epsilons({} if epsilon is None else {"agent_0": epsilon, "agent_1": float("nan")})
+        )
     assert seen == expected
 
 

@@ -10,7 +10,8 @@ Modules, in the order in which one reads them:
     windows       means over windows of episodes, in which every world counts alike
     statistics    estimates over replicas and differences, with intervals by Student's t, and Holm's families
     series        numbers while a training runs
-    outcome       how a training goes, and how it went
+    outcome       how a training went
+    live_label    how a running training goes
 """
 
 from cprl.measuring import social

@@ -32,8 +32,8 @@ def last_of(table: pa.Table, number: int) -> pa.Table:
     episode = table["episode"].to_numpy().astype(np.int64)
     size = int(episode.max(initial=0)) + 1
     keys, row = np.unique(world * size + episode, return_inverse=True)
-    lanes, counts = np.unique(keys // size, return_counts=True)
-    count = episodes_per_world(number, len(lanes) // len(np.unique(table["replica"].to_numpy())))
+    worlds, counts = np.unique(keys // size, return_counts=True)
+    count = episodes_per_world(number, len(worlds) // len(np.unique(table["replica"].to_numpy())))
     is_last = episodes_after(keys // size) < min(count, counts.min())
     return table.filter(pa.array(is_last[row]))
 
@@ -70,16 +70,16 @@ def mean_of_worlds(values: Float64, worlds: Int64, window: int) -> Float64:
     Returns:
         [E], each mean at its last episode; NaN until each world has ended enough episodes.
     """
-    lanes, counts = np.unique(worlds, return_counts=True)
-    count = min(episodes_per_world(min(window, len(values)), len(lanes)), int(counts.min()))
-    if len(lanes) == 1:
+    distinct_worlds, counts = np.unique(worlds, return_counts=True)
+    count = min(episodes_per_world(min(window, len(values)), len(distinct_worlds)), int(counts.min()))
+    if len(distinct_worlds) == 1:
         return np.concatenate([np.full(count - 1, np.nan), running_mean(values, count)])
-    means = np.full((len(lanes), len(values)), np.nan)
-    for lane, world in enumerate(lanes):
+    means = np.full((len(distinct_worlds), len(values)), np.nan)
+    for index, world in enumerate(distinct_worlds):
         ended = np.flatnonzero(worlds == world)
         curve = running_mean(values[ended], count)
         latest = np.searchsorted(ended, np.arange(len(values)), side="right") - count
-        means[lane, latest >= 0] = curve[latest[latest >= 0]]
+        means[index, latest >= 0] = curve[latest[latest >= 0]]
     return np.asarray(means.mean(0))
 
 

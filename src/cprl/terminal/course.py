@@ -64,8 +64,8 @@ def course_of(run: Path, agents: Sequence[AgentSpec]) -> str:
     if learns:
         outcome = outcome_of(table, random=levels[_RANDOM, COLLECTIVE_RETURN].value)
         lines = [
-            f"The agents began at {outcome.begins:.0f} apples an episode, all together, and reached "
-            f"{outcome.peak:.0f} around episode {outcome.around}.",
+            f"The agents began at {outcome.first_mean:.0f} apples an episode, all together, and reached "
+            f"{outcome.peak:.0f} around episode {outcome.peak_episode}.",
             f"While they learn, in {last_text(table)}, they get {_harvest_and_life(levels, _LEARNING)}.",
         ]
         conditions = f", where {_fresh_conditions(agents, table)},"

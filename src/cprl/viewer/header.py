@@ -11,7 +11,7 @@ from typing import Final, NamedTuple
 import numpy as np
 import rerun as rr
 
-from cprl.measuring.outcome import BEGINS, EXPLORING, Course
+from cprl.measuring.live_label import BEGINS, EXPLORING, Course
 from cprl.measuring.registry import COLLECTIVE_RETURN
 from cprl.measuring.series import logged, mean_of
 from cprl.measuring.statistics import Estimate, estimate_if_finite
@@ -248,7 +248,7 @@ class HeaderView(View):
         """Log whether agents explore, if that has changed; return the end of exploration in words, or ""."""
         explored = self.course.explores
         epsilons = {name: mean for name, mean in means.items() if name.endswith("/epsilon")}
-        explores = self.course.explore(epsilons)
+        explores = self.course.note_epsilons(epsilons)
         if explores == explored:
             return ""
         state = EXPLORING if explores else SETTLED

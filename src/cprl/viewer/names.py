@@ -2,7 +2,7 @@
 
 from typing import Final
 
-from cprl.measuring import outcome
+from cprl.measuring import live_label
 from cprl.pictures.colours import BLUE, GREEN, GREY, ORANGE, VERMILION
 from cprl.pictures.decoding import UNSEEN
 
@@ -34,14 +34,14 @@ DIED: Final = VERMILION
 SETTLED: Final = "settled"
 """The state of agents that no longer explore, which is not drawn."""
 STATES: Final = {
-    outcome.BEGINS: (80, 80, 80),
-    outcome.RISING: GREEN,
-    outcome.RECOVERING: BLUE,
-    outcome.STEADY: GREY,
-    outcome.FALLING: ORANGE,
-    outcome.BELOW: VERMILION,
-    outcome.DEAD: (140, 40, 0),
-    outcome.EXPLORING: (60, 90, 130),
+    live_label.BEGINS: (80, 80, 80),
+    live_label.RISING: GREEN,
+    live_label.RECOVERING: BLUE,
+    live_label.STEADY: GREY,
+    live_label.FALLING: ORANGE,
+    live_label.BELOW: VERMILION,
+    live_label.DEAD: (140, 40, 0),
+    live_label.EXPLORING: (60, 90, 130),
     SETTLED: BOARD_BACKGROUND,
 }
 """The colours of the live labels, and of the strip that says whether agents explore."""
