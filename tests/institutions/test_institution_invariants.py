@@ -181,7 +181,7 @@ def test_limits_charge_so_much_for_each_bite_beyond_them(game, seed):
 @given(game=games(), seed=SEEDS, share=st.sampled_from([0.3, 1.0]), window=st.integers(1, 9))
 def test_nobody_harvests_more_than_a_quota_in_a_window(game, seed, share, window):
     game = replace(game, institutions=(law.Quota(share=share, window_steps=window),))
-    most = share * game.law_parameters["quotas"]["unit"][0]
+    most = share * game.law_parameters["quotas"]["window_yield"][0]
     harvest, fines, _, counts = sums(game, seed)
     for first in range(0, len(harvest), window):
         assert (harvest[first : first + window].sum(0) <= most + 1e-6).all()

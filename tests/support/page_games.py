@@ -157,7 +157,7 @@ def word_of(*, seed, turn, site):
 
 def whole_number():
     """A quota that computes to 5.999999999999999 apples, and allows six."""
-    unit = float(commons(Quota()).law_parameters["quotas"]["unit"][0])
+    unit = float(commons(Quota()).law_parameters["quotas"]["window_yield"][0])
     share = 6 / unit
     while share * unit >= 6:
         share = float(np.nextafter(share, 0))

@@ -87,7 +87,7 @@ def stored(name, learner, turns):
         own = [buffer.storage[:turns]["next", "reward"][:, 0] for buffer in learner.memory.buffer.each]
         return torch.stack(own, 1).numpy()
     if name == "tables":
-        return np.stack([turn["reward"] for turn in learner._turns])
+        return np.stack([turn["reward"] for turn in learner.memory._turns])
     if name == "look ahead":
         return learner.memory.rollout.fields["reward"][0, :, 0, :turns].T.numpy()
     return learner.memory.rollout.fields["reward"][:, 0, :turns].transpose(0, 1).reshape(turns, -1).numpy()

@@ -80,5 +80,5 @@ def _quota(game: Game) -> dict[str, Any] | None:
         if quota.fine is not None:
             raise refusal("Quota.fine", quota.fine, f"None {_HERE}")
         fields = {name: getattr(quota, name) for name in ("share", "window_steps", "by_stock")}
-        return {**fields, "unit": float(game.law_parameters["quotas"]["unit"][0])}
+        return {**fields, "unit": float(game.law_parameters["quotas"]["window_yield"][0])}
     return None
