@@ -65,7 +65,7 @@ class FlatLoss(DistributionalDQNLoss):
 class AtomNetwork(nn.Module):
     """The distribution of each action's return over fixed values, called atoms."""
 
-    stacks_over = ("network",)  # whose weights those of many agents are stacked
+    inner_network_names = ("network",)  # stacked by itself for many agents
 
     def __init__(self, network, actions, lowest, highest, atoms):
         super().__init__()

@@ -16,7 +16,7 @@ from cprl.algorithms.base import Algorithm, TeamAlgorithm
 from cprl.learners.settings import EpsilonGreedy
 from cprl.objectives.rewards import Reward
 from cprl.policies.decisions import Bandit
-from cprl.policies.governors import Script
+from cprl.policies.governors import ScriptedGovernor
 from cprl.policies.language import Language as Language
 from cprl.policies.scripted import ScriptedPolicy
 from cprl.values import AgentIndices, Custom, Natural, Positive, Steps, Value, Where, checked
@@ -205,7 +205,7 @@ class Person(Value):
 
 AgentSpec: TypeAlias = Learning | Team | Scripted | Language | Frozen | Pool | Person
 """The specification of an agent, or of a team."""
-GovernorSpec: TypeAlias = Learning | Frozen | Script
+GovernorSpec: TypeAlias = Learning | Frozen | ScriptedGovernor
 """The specification of a governor. A `Frozen` one counts as the agent after the last of its run."""
 
 

@@ -159,7 +159,7 @@ def test_a_governor_decides_every_few_turns_and_not_before_its_first():
     assert decided == [0, 0, 0, 1, 1, 1, 1, 1]  # at turns 3 and 6: stocks of 0.3 and 0.6
     twin = GovernorActor(governor, StockRule())
     twin.load_state_dict(actor.state_dict())
-    assert (twin.turns, twin.rule.tolist()) == (8, [1])
+    assert (twin.turns, twin.options_in_force.tolist()) == (8, [1])
 
 
 INCOMES = np.array([[3.0, 1.0], [0.0, 0.0]])

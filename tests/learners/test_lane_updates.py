@@ -128,7 +128,7 @@ def test_the_stacked_networks_give_what_each_gives():
     expected = torch.stack([network(seen) for network, seen in zip(each, windows, strict=True)])
     torch.testing.assert_close(stacked(windows), expected)
     torch.testing.assert_close(stacked(windows[:, 0]), expected[:, 0])
-    pairs = stacked.stacked([stacked, StackedMLP(networks([3, 4, 5], relu_on_outputs=True))])
+    pairs = stacked.make_stack([stacked, StackedMLP(networks([3, 4, 5], relu_on_outputs=True))])
     torch.testing.assert_close(pairs(windows.expand(2, *windows.shape))[0], expected)
     with pytest.raises(ValueError, match="2 architectures"):
         StackedMLP([each[0], MLPNetwork(SHAPE, ACTIONS, hidden_cells=(8,))])

@@ -21,7 +21,7 @@ class Table(nn.Module):
         self.observation_dims, self.outputs = 1, outputs
         self.numbers = nn.Parameter(torch.randn(*spaces.observation_shape) * (spread if outputs > 1 else 0))
 
-    def stacked(self, tables):
+    def make_stack(self, tables):
         """One network with the numbers of L tables, [L, X]: [L, .., X] to [L, .., outputs]."""
         stack = deepcopy(self)
         stack.numbers = nn.Parameter(torch.stack([own.numbers.detach() for own in tables]))

@@ -14,9 +14,10 @@ but not together with the background agents, so that only the first difference r
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import pyarrow as pa
+from matplotlib.axes import Axes
 
 from cprl.evaluation.pages import heading, matrix_labels, matrix_table, row_table
 from cprl.evaluation.populations import (
@@ -48,6 +49,11 @@ FOCAL_RETURN: Final = "focal/return"
 BACKGROUND_RETURN: Final = "background/return"
 CROSS_PLAY_RETURNS: Final = (FOCAL_RETURN, BACKGROUND_RETURN, INCOME)
 """The returns of a cross-play: per focal agent, per background agent, and of all agents together."""
+_GAIN_SIDES: Final = {
+    FOCAL_RETURN: "the focal agent, beside the agent whose place it takes",
+    BACKGROUND_RETURN: "the background agents, beside themselves without it",
+}
+"""The returns of which `gains` are drawn, each with the words for its two sides."""
 
 Runs = Sequence[str | Path | LoadedRun] | Mapping[str, str | Path | LoadedRun]
 """Runs as directories or loaded, in a list, or in a mapping from the names that they get in tables."""
@@ -74,7 +80,7 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
             agent, no replica in common, or a seed with which a run was trained.
     """
     checked("diagonal", diagonal, Diagonal)
-    loaded = named_runs(runs)
+    loaded = load_by_name(runs)
     fresh = fresh_for(loaded.values(), fresh)
     replicas = fresh.replicas
     if diagonal == "cross_seed" and len(replicas) < 2:
@@ -82,9 +88,14 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
     next_replica = dict(zip(replicas, (*replicas[1:], replicas[0]), strict=True))
     tables = (
         play_fresh(
-            fresh, loaded[labels[BACKGROUND]], agents, labels, roles=roles, compared_runs=loaded.values()
+            fresh,
+            loaded[cell.labels[BACKGROUND]],
+            cell.agents,
+            cell.labels,
+            roles=cell.roles,
+            compared_runs=loaded.values(),
         )
-        for labels, agents, roles in _cells(loaded, diagonal, next_replica)
+        for cell in _cells(loaded, diagonal, next_replica)
     )
     per_focal_agent = " with focal agent at each index"
     return join_tables(
@@ -95,10 +106,20 @@ def crossplay(runs: Runs, fresh: Fresh = Fresh(), *, diagonal: Diagonal = "self"
     )
 
 
+class _Cell(NamedTuple):
+    """What is played for one index of the focal agent in a cell of the matrix."""
+
+    labels: dict[str, Any]
+    """The values of `CELL_LABELS` and of "focal_agent" in the table."""
+    agents: list[AgentOfReplica]
+    roles: list[str]
+    """The role of each agent."""
+
+
 def _cells(
     runs: Mapping[str, LoadedRun], diagonal: Diagonal, next_replica: Mapping[int, int]
-) -> Iterator[tuple[dict[str, Any], list[AgentOfReplica], list[str]]]:
-    """Yield the labels, the agents and their roles for each cell and each index of the focal agent.
+) -> Iterator[_Cell]:
+    """Yield what is played for each cell and each index of the focal agent.
 
     Args:
         runs: the runs by name.
@@ -109,15 +130,16 @@ def _cells(
         labels = {FOCAL: focal, BACKGROUND: background}
         background_agents = agents_of(runs[background])
         if focal == background and diagonal == "self":
-            yield labels | {"focal_agent": _SELF_PLAY}, background_agents, [BOTH] * len(background_agents)
+            roles = [BOTH] * len(background_agents)
+            yield _Cell(labels | {"focal_agent": _SELF_PLAY}, background_agents, roles)
             continue
         focal_agents = agents_of(runs[focal], next_replica if focal == background else None)
         for index, focal_agent in enumerate(focal_agents):
             agents = [*background_agents[:index], focal_agent, *background_agents[index + 1 :]]
-            yield labels | {"focal_agent": index}, agents, roles_of(len(agents), [index])
+            yield _Cell(labels | {"focal_agent": index}, agents, roles_of(len(agents), [index]))
 
 
-def named_runs(runs: Runs) -> dict[str, LoadedRun]:
+def load_by_name(runs: Runs) -> dict[str, LoadedRun]:
     """Load runs, and return them by name; refuse runs of different games, or of a game with one agent.
 
     A run's name is the one it is given, or else that of its directory, or its whole path if two directories
@@ -154,10 +176,10 @@ def gains(table: pa.Table) -> Family:
         The differences; the keys of the family are (focal, background, metric).
     """
 
-    def self_play_cell(cell: Mapping[str, str]) -> dict[str, str]:
+    def diagonal_cell(cell: Mapping[str, str]) -> dict[str, str]:
         return {FOCAL: cell[BACKGROUND]}
 
-    return differences(table, [FOCAL_RETURN, BACKGROUND_RETURN], CELL_LABELS, self_play_cell)
+    return differences(table, [FOCAL_RETURN, BACKGROUND_RETURN], CELL_LABELS, diagonal_cell)
 
 
 def by_focal_agent(table: pa.Table) -> pa.Table:
@@ -175,13 +197,6 @@ def by_focal_agent(table: pa.Table) -> pa.Table:
     return pa.concat_tables(tables).select(table.column_names)
 
 
-_GAINS: Final = {
-    FOCAL_RETURN: "the focal agent, beside the agent whose place it takes",
-    BACKGROUND_RETURN: "the background agents, beside themselves without it",
-}
-"""The returns of which `gains` are drawn, each with the words for its two sides."""
-
-
 def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page") -> Path:
     """Draw the `gains` as two matrices, with an agent's return on the diagonal.
 
@@ -190,28 +205,37 @@ def draw_gains(table: pa.Table, path: Path | str, *, width: style.Width = "page"
     """
     gain_estimates = gains(table)
     returns = estimates(table, FOCAL_RETURN, CELL_LABELS).column(FOCAL_RETURN)
-    self_play = {pair: f"{returns[pair].value:.3g}" for pair in returns if pair[0] == pair[1]}
+    diagonal_returns = {pair: f"{returns[pair].value:.3g}" for pair in returns if pair[0] == pair[1]}
     rewards = rewards_of(table)
     unit = f", {rewards}" if rewards else ""
     diagonal_word = table_note(table, "diagonal").replace("_", "-")
-    rows, columns = (dict(zip(labels, labels, strict=True)) for labels in matrix_labels(gain_estimates))
+    rows = len(matrix_labels(gain_estimates)[0])
     with style.drawing(path, width=width, colours=picture_files.PNG_SHADES) as sheet:
-        panels = sheet.panels(len(_GAINS), row_height_em=matrix_height(len(rows)))
-        for axes, (metric, panel_title) in zip(panels, _GAINS.items(), strict=True):
-            values = {}
-            texts = dict(self_play)
-            for pair, estimate in gain_estimates.column(metric).items():
-                values[pair] = estimate.value
-                texts[pair] = f"{estimate.value:+.3g}" + " *" * estimate.differs
-            draw_matrix(sheet, axes, rows, columns, values, texts)
-            axes.set(xlabel=BACKGROUND, ylabel=FOCAL)
-            axes.set_title(panel_title)
+        panels = sheet.panels(len(_GAIN_SIDES), row_height_em=matrix_height(rows))
+        for axes, metric in zip(panels, _GAIN_SIDES, strict=True):
+            _draw_gain_panel(sheet, axes, metric, gain_estimates, diagonal_returns)
         sheet.title = "Cross-play: who gains among whom"
         sheet.caption = (
             f"Difference in return{unit}; {table_note(table, 'fresh')} with focal agent at each index; "
             f"diagonal ({diagonal_word}): an agent's return. {HOLM_NOTE} for these {len(gain_estimates)}."
         )
     return Path(path)
+
+
+def _draw_gain_panel(
+    sheet: style.Sheet, axes: Axes, metric: str, gain_estimates: Family, diagonal_returns: dict[Any, str]
+) -> None:
+    """Draw the gains in one return as a matrix, with an agent's return, as text, in the cells of the
+    diagonal."""
+    rows, columns = (dict(zip(labels, labels, strict=True)) for labels in matrix_labels(gain_estimates))
+    values = {}
+    texts = dict(diagonal_returns)
+    for pair, estimate in gain_estimates.column(metric).items():
+        values[pair] = estimate.value
+        texts[pair] = f"{estimate.value:+.3g}" + " *" * estimate.differs
+    draw_matrix(sheet, axes, rows, columns, values, texts)
+    axes.set(xlabel=BACKGROUND, ylabel=FOCAL)
+    axes.set_title(_GAIN_SIDES[metric])
 
 
 def crossplay_tables(table: pa.Table) -> Iterator[TextTable]:
@@ -221,7 +245,7 @@ def crossplay_tables(table: pa.Table) -> Iterator[TextTable]:
     """
     rewards = rewards_of(table)
     gain_estimates = gains(table)
-    for metric, sides in _GAINS.items():
+    for metric, sides in _GAIN_SIDES.items():
         name = with_unit(metric, rewards=rewards)
         title = f"{name}, difference of {sides}, paired by replica [95 % interval by Student's t]"
         yield matrix_table(gain_estimates, metric, title, gain_estimates.note("of both tables"))

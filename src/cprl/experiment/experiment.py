@@ -14,7 +14,7 @@ from cprl.experiment.engine import Engine, engine_of
 from cprl.measuring.tracker import check_custom_metrics
 from cprl.objectives.rewards import check_reward
 from cprl.pictures.readable import game_html
-from cprl.policies.governors import Script
+from cprl.policies.governors import ScriptedGovernor
 from cprl.population import (
     AgentSpec,
     Frozen,
@@ -331,7 +331,7 @@ def _check_governor(experiment: Experiment) -> None:
     governor = getattr(experiment.game, "governor", None)
     if governor is None:
         raise ValueError(f"experiment.governor is {spec}; allowed in a game without a Governor: None")
-    if isinstance(spec, Script):
+    if isinstance(spec, ScriptedGovernor):
         spec.check(governor)
     if isinstance(spec, Learning) and spec != Learning(spec.algorithm):
         raise ValueError(f"experiment.governor is {spec}; allowed for a governor: Learning(algorithm) alone")

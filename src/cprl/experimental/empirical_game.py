@@ -29,7 +29,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib.axes import Axes
 
-from cprl.evaluation.cross_play import CELL_LABELS, FOCAL_RETURN, Runs, named_runs
+from cprl.evaluation.cross_play import CELL_LABELS, FOCAL_RETURN, Runs, load_by_name
 from cprl.evaluation.pages import heading, matrix_table
 from cprl.evaluation.populations import agents_of, fresh_for, join_tables, play_fresh, rotations, table_note
 from cprl.experimental.payoff_table import PayoffTable, compositions
@@ -81,7 +81,7 @@ def play_empirical_game(runs: Runs, fresh: Fresh = Fresh(episodes=5)) -> pa.Tabl
         many agents play as each run, and "runs", the names of all agents' runs; "role" is the name of the
         agent's own.
     """
-    by_name = named_runs(runs)
+    by_name = load_by_name(runs)
     names = list(by_name)
     agents = by_name[names[0]].game.agents
     profiles = len(names) ** agents

@@ -13,7 +13,7 @@ class AgentNetworks(nn.ModuleDict):
     """
 
     @property
-    def stacks_over(self) -> tuple[str, ...]:
+    def inner_network_names(self) -> tuple[str, ...]:
         """Return the names of the networks, each of which is stacked by itself, see
         `cprl.networks.stacked.stack_lanes`."""
         return tuple(self.keys())
@@ -49,7 +49,7 @@ class JointNetwork(nn.Module):
         temperature: in units of reward, see `cprl.objectives.pr2.marginal`.
     """
 
-    stacks_over: ClassVar = ("network",)
+    inner_network_names: ClassVar = ("network",)
 
     def __init__(self, network: nn.Module, *, actions: int, peers: int, temperature: float) -> None:
         super().__init__()

@@ -141,7 +141,7 @@ class RecurrentNetwork(nn.Module):
         steps = 1 if is_init is None else is_init.shape[-1]
         return _outputs(weights, self.encoder(observation), state, is_init, (1, -1, steps))
 
-    def stacked(self, networks: Sequence["RecurrentNetwork"]) -> "StackedRecurrent":
+    def make_stack(self, networks: Sequence["RecurrentNetwork"]) -> "StackedRecurrent":
         """Return one network with the parameters of all lanes along a first axis; copies."""
         return StackedRecurrent(networks)
 

@@ -6,12 +6,21 @@ takes the weights of one lane out again.
 
 from collections.abc import Iterable, Sequence
 from copy import deepcopy
-from typing import Any
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor, nn
 
 from cprl.networks.mlp import MLPNetwork
+
+
+@runtime_checkable
+class MakesStack(Protocol):
+    """A network that stacks the networks of lanes itself."""
+
+    def make_stack(self, networks: Sequence[Any]) -> nn.Module:
+        """Return one network with copies of the parameters of all `networks` along a first axis; its method
+        `lane_state(lane)` takes the state dict of one of them out again."""
 
 
 class StackedMLP(nn.Module):
@@ -32,7 +41,8 @@ class StackedMLP(nn.Module):
         self.relu_on_outputs = first.relu_on_outputs
         self.observation_dims = first.observation_dims
         self.outputs = first.outputs
-        self._names = [name for name, layer in first.named_modules() if isinstance(layer, nn.Linear)]
+        self._layer_names = [name for name, layer in first.named_modules() if isinstance(layer, nn.Linear)]
+        """The names of the linear layers in an `MLPNetwork`, in the order of `weights` and `biases`."""
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         for layers in zip(*(network.linears for network in networks), strict=True):
@@ -45,20 +55,20 @@ class StackedMLP(nn.Module):
         dims: int = self.weights[0].ndim
         return dims - 3
 
-    def stacked(self, stacks: Sequence["StackedMLP"]) -> "StackedMLP":
+    def make_stack(self, networks: Sequence["StackedMLP"]) -> "StackedMLP":
         """Return R stacks as one stack with copies of their parameters, [R, S, ...]."""
         stack_of_stacks = deepcopy(self)
-        stack_of_stacks.weights = _stack_each(stack.weights for stack in stacks)
-        stack_of_stacks.biases = _stack_each(stack.biases for stack in stacks)
+        stack_of_stacks.weights = _stack_each(stack.weights for stack in networks)
+        stack_of_stacks.biases = _stack_each(stack.biases for stack in networks)
         return stack_of_stacks
 
     def lane_state(self, lane: int) -> dict[str, Tensor]:
-        """Return copies of the weights of one lane, as the state dict of its `MLPNetwork`; of R stacks, the
-        weights of one stack, as its state dict."""
+        """Return copies of the weights at an index of the first axis: those of a lane, as the state dict of
+        its `MLPNetwork`; of R stacks, those of a whole stack of S lanes, as its state dict."""
         if self.lane_axis:
             return {name: value[lane].clone() for name, value in self.state_dict().items()}
         state = {}
-        for name, weight, bias in zip(self._names, self.weights, self.biases, strict=True):
+        for name, weight, bias in zip(self._layer_names, self.weights, self.biases, strict=True):
             state[f"{name}.weight"] = weight[lane].detach().T.clone()
             state[f"{name}.bias"] = bias[lane, 0].detach().clone()
         return state
@@ -96,7 +106,8 @@ class StackedModules(nn.Module):
         self.observation_dims = int(first.observation_dims)
         self.outputs = getattr(first, "outputs", None)
         self.state_shape = getattr(first, "state_shape", None)
-        self._names = [name for name, _ in first.named_parameters()]
+        self._parameter_names = [name for name, _ in first.named_parameters()]
+        """The names of a lane's parameters, in the order of `weights`."""
         # No submodule: the parameters of this module are the stacked ones, not those of the template.
         self.__dict__["template"] = deepcopy(first)
         self.weights = _stack_each(network.parameters() for network in networks)
@@ -105,7 +116,7 @@ class StackedModules(nn.Module):
         """Return copies of the weights of one lane, as the state dict of its network."""
         return {
             name: weight[lane].detach().clone()
-            for name, weight in zip(self._names, self.weights, strict=True)
+            for name, weight in zip(self._parameter_names, self.weights, strict=True)
         }
 
     def forward(self, observation: Tensor, *recurrent: Tensor) -> Any:
@@ -129,33 +140,27 @@ class StackedModules(nn.Module):
         return tuple(result.reshape(*batch_shape, *result.shape[len(lane_shape) :]) for result in results)
 
     def _call_template(self, weights: list[Tensor], *inputs: Tensor) -> Any:
-        """Return the outputs of one lane's network, by its weights in the order of `self._names`."""
-        by_name = dict(zip(self._names, weights, strict=True))
+        """Return the outputs of one lane's network, by its weights in the order of `_parameter_names`."""
+        by_name = dict(zip(self._parameter_names, weights, strict=True))
         return torch.func.functional_call(self.__dict__["template"], by_name, inputs)
 
 
 def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
     """Return one network with copies of the parameters of all lanes along a lane axis.
 
-    Its class depends on the networks of the lanes: what their method `stacked` returns, if they have one; a
-    `StackedMLP` of `MLPNetwork`s; a network of the same class whose inner networks are stacked, where the
-    class names these in `stacks_over`; else a `StackedModules`.
+    Its class depends on the networks of the lanes: what `make_stack` of the first returns, if it is a
+    `MakesStack`; a network of the same class whose inner networks are stacked, where the class names these
+    in `inner_network_names`; a `StackedMLP` of `MLPNetwork`s; else a `StackedModules`.
 
     Raises:
         ValueError: if the lanes' networks have several architectures, or cannot be stacked.
     """
     first: Any = networks[0]
-    if hasattr(first, "stacked"):
-        return first.stacked(networks)
-    inner_names = _inner_networks(first)
+    if isinstance(first, MakesStack):
+        return first.make_stack(networks)
+    inner_names = _inner_names(first)
     if inner_names and all(type(network) is type(first) for network in networks):
-        stack: Any = deepcopy(first)
-        for name in inner_names:
-            setattr(stack, name, stack_lanes([getattr(network, name) for network in networks]))
-        for name, _ in first.named_parameters(recurse=False):
-            weights = torch.stack([getattr(network, name).detach() for network in networks])
-            setattr(stack, name, nn.Parameter(weights))
-        return stack
+        return _stack_around_inner(networks, inner_names)
     if all(isinstance(network, MLPNetwork) for network in networks):
         return StackedMLP(networks)  # type: ignore[arg-type]
     if not all(hasattr(network, "observation_dims") for network in networks):
@@ -165,10 +170,25 @@ def stack_lanes(networks: Sequence[nn.Module]) -> nn.Module:
     return StackedModules(networks)
 
 
+def _stack_around_inner(networks: Sequence[nn.Module], inner_names: Sequence[str]) -> nn.Module:
+    """Return one network of the same class, whose inner networks are stacked each by itself.
+
+    The parameters around them get a lane axis in front. Buffers are those of the first network: they must be
+    the same constants in all lanes.
+    """
+    stack = deepcopy(networks[0])
+    for name in inner_names:
+        setattr(stack, name, stack_lanes([getattr(network, name) for network in networks]))
+    for name, _ in networks[0].named_parameters(recurse=False):
+        weights = torch.stack([getattr(network, name).detach() for network in networks])
+        setattr(stack, name, nn.Parameter(weights))
+    return stack
+
+
 def lane_state(stack: nn.Module, lane: int) -> dict[str, Tensor]:
     """Return copies of the weights of one lane of a network that `stack_lanes` made, as the state dict of the
     lane's network."""
-    inner_names = _inner_networks(stack)
+    inner_names = _inner_names(stack)
     if not inner_names:
         return stack.lane_state(lane)  # type: ignore[operator]
     weights = {name: value[lane].detach().clone() for name, value in stack.named_parameters(recurse=False)}
@@ -181,13 +201,13 @@ def lane_state(stack: nn.Module, lane: int) -> dict[str, Tensor]:
     return {**weights, **buffers, **inner_weights}
 
 
-def _inner_networks(network: Any) -> list[str]:
+def _inner_names(network: Any) -> list[str]:
     """Return the names of the attributes that hold the inner networks of a network.
 
-    A network that computes with the outputs of other networks names them in its attribute `stacks_over`.
-    Each is stacked by itself; the network's remaining parameters get a lane axis in front.
+    A network that computes with the outputs of other networks lists them in its attribute
+    `inner_network_names`; one of them may be None.
     """
-    names = getattr(network, "stacks_over", ())
+    names = getattr(network, "inner_network_names", ())
     return [name for name in names if getattr(network, name) is not None]
 
 

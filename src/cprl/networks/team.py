@@ -39,9 +39,9 @@ class TeamNetwork(nn.Module):
             self.members = stack_lanes(networks) if are_stackable else nn.ModuleList(networks)
 
     @property
-    def stacks_over(self) -> tuple[str, ...]:
-        """Return the inner networks that `cprl.networks.stacked.stack_lanes` stacks by themselves; a team
-        without any is computed by `torch.vmap`."""
+    def inner_network_names(self) -> tuple[str, ...]:
+        """Return the names of the inner networks that `cprl.networks.stacked.stack_lanes` stacks by
+        themselves; a team without any is computed by `torch.vmap`."""
         is_shared_network = self.shares and self.state_shape is None
         return ("members",) if is_shared_network or isinstance(self.members, StackedMLP) else ()
 
@@ -90,7 +90,7 @@ class CentralCritic(nn.Module):
         members: the number of members S.
     """
 
-    stacks_over: ClassVar = ("network",)
+    inner_network_names: ClassVar = ("network",)
 
     def __init__(self, network: nn.Module, members: int) -> None:
         super().__init__()
@@ -128,7 +128,7 @@ class JointCritics(nn.Module):
         highest: the largest value of an observation; without encoders, observations are divided by it.
     """
 
-    stacks_over: ClassVar = ("heads", "encoders")
+    inner_network_names: ClassVar = ("heads", "encoders")
 
     def __init__(
         self,

@@ -43,12 +43,12 @@ class StockRule(Value):
         if "stock" not in governor.sees:
             raise ValueError(f'Governor.sees is {governor.sees}; allowed for a StockRule: "stock" among them')
 
-    def choose(self, governor: Governor, seen: Tensor) -> Tensor:
-        """Return the options for B worlds, int64 [B]; `seen`: float [B, S]."""
-        stock = seen[:, governor.sees.index("stock")]
+    def choose(self, governor: Governor, features: Tensor) -> Tensor:
+        """Return the options for B worlds, int64 [B]; `features`: float [B, S]."""
+        stock = features[:, governor.sees.index("stock")]
         allowed = ((stock - self.lower) / (self.upper - self.lower)).clamp(0, 1)
         wanted = allowed if governor.sets == "quota.share" else 1 - allowed
-        options = seen.new_tensor(governor.options)
+        options = features.new_tensor(governor.options)
         return (options - wanted[:, None] * options[-1]).abs().argmin(1)
 
 
@@ -67,12 +67,13 @@ class Constant(Value):
         if self.number not in governor.options:
             raise ValueError(f"Constant.number is {self.number:g}; allowed: one of {governor.options}")
 
-    def choose(self, governor: Governor, seen: Tensor) -> Tensor:
-        """Return the option for B worlds, int64 [B]; `seen`: float [B, S]."""
-        return torch.full((len(seen),), governor.options.index(self.number), device=seen.device)
+    def choose(self, governor: Governor, features: Tensor) -> Tensor:
+        """Return the option for B worlds, int64 [B]; `features`: float [B, S]."""
+        return torch.full((len(features),), governor.options.index(self.number), device=features.device)
 
 
-Script: TypeAlias = StockRule | Constant
+ScriptedGovernor: TypeAlias = StockRule | Constant
+"""A governor that does not learn: it decides by what it sees in this turn alone."""
 
 
 def governor_spaces(game: Game) -> Spaces:
@@ -88,25 +89,28 @@ def governor_spaces(game: Game) -> Spaces:
 
 
 class GovernorActor(nn.Module):
-    """Decides for B worlds at once, in each turn whose number is a multiple of `Governor.every_steps`, the
-    first being 0.
+    """Decides for B worlds at once. It decides first in the first turn from `from_turn` on that is a multiple
+    of `Governor.every_steps`, then every so many turns.
 
     Args:
         governor: the governor that decides.
-        by: how.
-        from_turn: the turn from which on it decides; until its first decision the first option is in force.
+        decider: chooses its options: a `LaneActor` by a network, a `ScriptedGovernor` by a rule.
+        from_turn: the turn from which on it decides, the first turn being 0; until its first decision the
+            first option is in force.
     """
 
-    def __init__(self, governor: Governor, by: LaneActor | Script, *, from_turn: int = 0) -> None:
+    def __init__(
+        self, governor: Governor, decider: LaneActor | ScriptedGovernor, *, from_turn: int = 0
+    ) -> None:
         super().__init__()
         self.governor = governor
-        self.by: Any = by
+        self.by: Any = decider  # a part of the names in checkpoints
         self.from_turn = from_turn
         self.turns = 0
         """The turns so far."""
-        self.rule: Tensor | None = None
-        """The options in force, int64 [B]; None before the first turn."""
-        self.seen: Tensor | None = None
+        self.options_in_force: Tensor | None = None
+        """The index of each world's option, int64 [B]; None before the first turn."""
+        self.last_features: Tensor | None = None
         """What the governor saw when it decided last, float32 [B, S]; None before its first decision."""
 
     @property
@@ -114,27 +118,31 @@ class GovernorActor(nn.Module):
         """Return whether it decides in the coming turn."""
         return self.turns >= self.from_turn and self.turns % self.governor.every_steps == 0
 
-    def decide(self, seen: Tensor) -> Tensor:
-        """Return the options in force in the coming turn, int64 [B]; `seen`: float32 [B, S]."""
-        if self.rule is None:
-            self.rule = torch.zeros(len(seen), dtype=torch.int64, device=seen.device)
+    def decide(self, features: Tensor) -> Tensor:
+        """Return the options in force in the coming turn, int64 [B]; `features`: float32 [B, S]."""
+        if self.options_in_force is None:
+            self.options_in_force = torch.zeros(len(features), dtype=torch.int64, device=features.device)
         if self.is_due:
-            self.seen = seen
-            self.rule = self._choose(seen)
+            self.last_features = features
+            self.options_in_force = self._choose(features)
         self.turns += 1
-        return self.rule
+        return self.options_in_force
 
-    def _choose(self, seen: Tensor) -> Tensor:
-        """Return the options for B worlds; one world is played by the governor of the first replica."""
+    def _choose(self, features: Tensor) -> Tensor:
+        """Return the options for B worlds.
+
+        A network decides for all replicas x worlds; where one world is played, its decision in the first
+        replica counts.
+        """
         if not isinstance(self.by, LaneActor):
-            return self.by.choose(self.governor, seen)
+            return self.by.choose(self.governor, features)
         worlds = self.by.replicas * self.by.worlds
-        return self.by.choose(seen.expand(worlds, -1)[:, None])[: len(seen), 0]
+        return self.by.choose(features.expand(worlds, -1)[:, None])[: len(features), 0]
 
     def get_extra_state(self) -> dict[str, Any]:
-        return {"turns": self.turns, "rule": self.rule, "seen": self.seen}
+        return {"turns": self.turns, "rule": self.options_in_force, "seen": self.last_features}
 
     def set_extra_state(self, state: Mapping[str, Any]) -> None:
         self.turns = int(state["turns"])
-        self.rule = state["rule"]
-        self.seen = state["seen"]
+        self.options_in_force = state["rule"]
+        self.last_features = state["seen"]

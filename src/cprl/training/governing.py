@@ -51,7 +51,7 @@ class Governing:
 
     def store(self, turn: Turn) -> None:
         """Count a turn, and learn at the end of a period, if the governor learns."""
-        if self.learner is None or self.actor.seen is None:
+        if self.learner is None or self.actor.last_features is None:
             return
         before = self._period
         now = turn.batch["next"].select(*_COUNTED).cpu().numpy()
@@ -72,13 +72,13 @@ class Governing:
 
     def _transitions(self) -> TensorDict:
         """Return the period as a turn of agents of which the last is the governor."""
-        assert self.actor.seen is not None
-        assert self.actor.rule is not None
+        assert self.actor.last_features is not None
+        assert self.actor.options_in_force is not None
         period = self._period
         reward = welfare(self._game, period["income"], period["steps"][:, 0], period[keys.STOCK][:, 0])
         entries = {
-            keys.OBSERVATION: self._as_last(self.actor.seen),
-            keys.ACTION: self._as_last(self.actor.rule),
+            keys.OBSERVATION: self._as_last(self.actor.last_features),
+            keys.ACTION: self._as_last(self.actor.options_in_force),
             ("next", *keys.OBSERVATION): self._as_last(torch.from_numpy(period[keys.SEEN])),
             ("next", *keys.REWARD): self._as_last(torch.tensor(reward, dtype=torch.float32)[:, None]),
             ("next", keys.DONE): torch.from_numpy(period[keys.DONE]),

@@ -25,7 +25,7 @@ from cprl.networks.stacked import stack_lanes
 from cprl.policies.actors import LaneActor
 from cprl.policies.asking import CALLS, Calls
 from cprl.policies.decisions import Decider, ballot_sizes
-from cprl.policies.governors import GovernorActor, Script, governor_spaces
+from cprl.policies.governors import GovernorActor, ScriptedGovernor, governor_spaces
 from cprl.policies.joint_policy import ActorAgents, JointPolicy
 from cprl.policies.language import LanguageActor
 from cprl.policies.rng import Purpose, lane_name, lane_seeds
@@ -420,12 +420,12 @@ def stored_governor(
         return None
     assert isinstance(playing, Game)
     assert playing.governor is not None
-    by: Any = stored[0].spec
-    if not isinstance(by, Script):
+    decider: Any = stored[0].spec
+    if not isinstance(decider, ScriptedGovernor):
         lanes = {playing.agents: stored}
         actors = stored_actors(lanes, governor_spaces(playing), seeds=seeds, worlds=worlds, stacks=True)
-        (by,) = actors.values()
-    return GovernorActor(playing.governor, by)
+        (decider,) = actors.values()
+    return GovernorActor(playing.governor, decider)
 
 
 def decision_values(agents: Mapping[int, Sequence[StoredAgent]]) -> dict[int, list[Tensor]]:

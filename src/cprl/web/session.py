@@ -11,7 +11,7 @@ from cprl.commons.game import Game
 from cprl.evaluation.fresh import typical_replica
 from cprl.evaluation.play import game_and_run
 from cprl.institutions import Institution
-from cprl.policies.governors import Script
+from cprl.policies.governors import ScriptedGovernor
 from cprl.policies.scripted import ScriptedPolicy
 from cprl.population import AgentSpec, Frozen, GovernorSpec, Scripted
 from cprl.training.stored import LoadedRun, load
@@ -30,7 +30,7 @@ class HostedSession(Hosting, stored=False, called="session"):
     """The game; or the name of a published board, the directory of a run, or a file with a drawing."""
     rounds: tuple[tuple[ShortText, Treatment], ...] = ()
     """The treatment of each round with its name; () for one round of the game as it is."""
-    governor: Frozen | Script | None = None
+    governor: Frozen | ScriptedGovernor | None = None
     """By what the governor of a game decides, see `cprl.Experiment.governor`; None for that of the run whose
     agents may play, if it fits, or else the first option."""
     consent: str | None = field(default=None, repr=False)
@@ -65,7 +65,7 @@ class HostedSession(Hosting, stored=False, called="session"):
         try:
             game = rules if isinstance(rules, Game) else replace(base, institutions=rules)
             game = replace(game, map=maps.with_agents(game.map, self.people + len(self.agents)))
-            if game.governor is not None and isinstance(self.governor, Script):
+            if game.governor is not None and isinstance(self.governor, ScriptedGovernor):
                 self.governor.check(game.governor)
             return with_turns(game, self.turns or game.rules.episode_steps)
         except ValueError as error:
