@@ -44,8 +44,8 @@ Coefficient = Annotated[float, Range(0, 1e6)]
 class Algorithm(Value, stored=False):
     """The base of algorithms: it makes the networks, memory, loss and learner of agents.
 
-    Agents with equal algorithms learn as lanes of one update. So an algorithm must be a frozen dataclass,
-    whose values can be compared.
+    Agents whose specifications are equal, algorithm included, learn as lanes of one update. So an algorithm
+    must be a frozen dataclass, whose values can be compared.
     """
 
     settings: Any
@@ -271,8 +271,8 @@ class OffPolicy(Algorithm, stored=False):
         return self.new_network(spaces, spaces.actions, relu_on_outputs=relu)
 
     def bootstrapped(self, loss: LossModule) -> LossModule:
-        """Return a loss after setting its target, r + gamma times the next value, with gamma of the
-        settings."""
+        """Return a loss after setting its target, r + gamma times the next value, or r after a terminal turn,
+        with gamma of the settings."""
         loss.make_value_estimator(ValueEstimators.TD0, gamma=self.settings.gamma)
         return loss
 

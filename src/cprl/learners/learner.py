@@ -76,8 +76,8 @@ class Learner:
     """The learner of S agents of each of R replicas, by one algorithm.
 
     Each lane has its own network, targets, optimiser state, memory and random numbers, and learns exactly as
-    it would alone. The training loop calls `begin` once, then in each turn `store`, `update` and
-    `end_episode`.
+    it would alone. The training loop calls `begin` once, `store` after each turn, `update` after every
+    `update_every` turns, and `end_episode` where episodes have ended.
 
     Args:
         algorithm: a `cprl.algorithms.Algorithm`, which makes the networks, the memory and the loss.

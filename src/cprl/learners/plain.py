@@ -49,6 +49,7 @@ def train_plainly(env: EnvBase, learner: Learner, *, episodes: int) -> None:
     Args:
         env: the worlds of all replicas, [B].
         learner: the learner of all agents, e.g. `DQN(settings=settings).make_learner(lanes, "torchrl")`.
+            Its actor is a `cprl.policies.actors.LaneActor`.
         episodes: the number of episodes to play, in all worlds together.
     """
     learner.begin()

@@ -50,7 +50,8 @@ class Replay:
         self._steps = 0
         """The steps stored for each replica; a turn of W worlds is W steps."""
         self._steps_owed = 0
-        """The steps from `_first_update` on for which no update was taken yet."""
+        """The steps from `_first_update` on for which no update was taken yet; not read where every step has
+        one."""
         self._first_update = max(settings.learning_starts, (form.steps_ahead + 1) * lanes.worlds)
         """The step of the first update: `learning_starts`, or the step at which each world has stored enough
         turns for one sample."""

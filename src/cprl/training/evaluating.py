@@ -35,7 +35,8 @@ from cprl.values import Custom
 def make_agents(
     experiment: Experiment, *, starts: bool = True, weights: Mapping[str, str] | None = None
 ) -> tuple[EnvBase, Population]:
-    """Make the worlds of a training and its agents; refuse what would fail in the training or its evaluation.
+    """Make the worlds of a training and its `Population` of agents; refuse what would fail in the training or
+    its evaluation.
 
     Args:
         starts: whether agents with `start_from` get the stored weights; a resumed training reads its own.

@@ -128,7 +128,7 @@ class _Refusing(dict[str, bool]):
 
 def promise_targets(loss: LossModule) -> None:
     """Mark the targets of a loss as updated, so that it does not warn about a missing TorchRL updater;
-    `LaneNetworks.copy_to_targets` updates them."""
+    the networks that have the loss update them."""
     targets = _targets_of(loss)
     for name in targets:
         targets[name] = True
