@@ -113,7 +113,7 @@ def test_the_notebook_runs(tmp_path):
         for output in cell.get("outputs", ())
         if output.output_type == "execute_result"
     ]
-    assert ["<svg" in html for html in shown] == [True, True, False, False]
+    assert ["<img" in html for html in shown] == [True, True, False, False]
     assert ["<iframe" in html for html in shown] == [False, False, True, True]
     assert "A quota" in shown[2]
     assert streams(notebook, "stderr") == []

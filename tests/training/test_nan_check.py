@@ -22,6 +22,7 @@ from cprl.learners.lanes import Lanes
 from cprl.learners.learner import Learner
 from cprl.learners.lola import LOLANetworks
 from cprl.learners.plain import PlainNetworks
+from cprl.learners.tabular import TabularNetworks
 from cprl.networks.finite import all_finite, finite_lanes
 from cprl.population import Learning
 from cprl.runs.checkpoints import Checkpointer, checkpoints_in
@@ -62,9 +63,10 @@ def learner_named(name, **changes):
 
 def tensors_of(learner, replica, agent):
     """The trained weights of a lane, as tensors to write into."""
-    if hasattr(learner, "tables"):
+    if isinstance(learner.lane_networks, TabularNetworks):
         lane = replica * len(learner.agents) + agent
-        return [torch.from_numpy(learner.tables.values)[list(learner.tables.rows[lane].values())[-1]]]
+        tables = learner.lane_networks.tables
+        return [torch.from_numpy(tables.values)[list(tables.rows[lane].values())[-1]]]
     of_replica = len(learner.lanes) // learner.replicas
     lane = replica * of_replica + (agent if of_replica > 1 else 0)
     if isinstance(learner.lane_networks, LOLANetworks):

@@ -61,7 +61,7 @@ def values(outcomes: Outcomes, condition: str, metric: str, measure: Measure) ->
 def level(outcomes: Outcomes, condition: str, metric: str, measure: Measure) -> Estimate:
     """Return the mean of a metric over the replicas of a condition."""
     clock = outcomes.table.design.clocks[condition]
-    return estimate(values(outcomes, condition, metric, measure)).of(metric, clock)
+    return estimate(values(outcomes, condition, metric, measure)).bounded(metric, clock)
 
 
 def change(

@@ -331,7 +331,7 @@ def exploration_lines(study: Study, outcomes: Outcomes) -> list[str]:
 
 def mean_text(values: Mapping[int, float], metric: str = INCOME, turns: float = inf) -> str:
     """Return the mean over replicas with its interval, which ends where the metric does."""
-    return str(estimate([*values.values()]).of(metric, turns)) if values else UNMEASURED
+    return str(estimate([*values.values()]).bounded(metric, turns)) if values else UNMEASURED
 
 
 def judged_page(study: Path, results: Path = RESULTS) -> list[str]:

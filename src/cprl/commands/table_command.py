@@ -77,8 +77,6 @@ def table(
     for flag, value in (("--summary", summary), ("--figures", figures)):
         if value and by:
             raise ValueError(f"{flag} is of a study; allowed: without --by, cprl table STUDY {flag}")
-    from cprl.measuring.table import where
-
     if by:
         study_table = _pool_runs(runs, by, reference, window)
     else:
@@ -101,6 +99,8 @@ def table(
             say(f"Figure: {path}")
     rows = study_table.rows
     if compare.metric:
+        from cprl.measuring.table import where
+
         rows = where(rows, metric=compare.metric)
     files.write(replace(study_table, rows=rows).as_arrow(), tables, notes=str(study_table).split("\n"))
     _exit_if_damaged(study_table)
