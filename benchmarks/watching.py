@@ -33,10 +33,9 @@ from cprl import CommonsEnv, presets
 from cprl.algorithms import DQN
 from cprl.experimental.current_policy import CurrentPolicy
 from cprl.experimental.exhibition import EXHIBITED_WORLD, Exhibition
-from cprl.learners.lanes import Lanes
 from cprl.measuring import Episode
 from cprl.measuring.series import Observer
-from cprl.population import Scripted
+from cprl.population import Learning, Scripted
 from cprl.system.process import prepare_process
 from cprl.training import Schedule, Training
 from cprl.training.agents import Population
@@ -91,9 +90,9 @@ def cost(run: Path, repeats: int) -> Cost:
     prepare_process(0)
     game = presets.game("commons")
     settings = replace(presets.dqn_settings("commons"), buffer_size=20_000)
-    learner = DQN(settings=settings).make_learner(Lanes(game.spaces, agents=AGENTS, replicas=REPLICAS))
     env = CommonsEnv(game, REPLICAS, seed=0)
-    training = Training(env, {AGENTS: learner}, Schedule(episodes=10**9))
+    population = Population(env, [Learning(DQN(settings=settings))] * game.agents)
+    training = Training(env, population.learners, Schedule(episodes=10**9))
     steps = game.rules.episode_steps
 
     clock = Watched()
@@ -135,7 +134,7 @@ def cost(run: Path, repeats: int) -> Cost:
         drawn = ratio(watch)
         watch.schedule.every = 10**9
         others = ratio(watch)
-    policy = CurrentPolicy({AGENTS: (learner.evaluation_actor(1), learner.actor)}, {}, replicas=REPLICAS)
+    policy = CurrentPolicy(population)
     world = CommonsEnv(game, 1, seed=0, first_world=EXHIBITED_WORLD)
 
     def exhibit(trained, logger):
