@@ -82,7 +82,8 @@ class VariedOptions(TrialOptions):
     """Options that say what is varied, and how trials are run."""
 
     vary: Words = ()
-    """PATH=VALUE,VALUE,... e.g. game.rules.freeze-steps=5,25,100; repeated, every combination is run."""
+    """PATH=VALUE,VALUE,... e.g. game.rules.freeze-steps=5,25,100, or PATH=loguniform(LOW,HIGH); may be
+    repeated. A sweep runs every combination of values, a search the points that it chooses."""
 
 
 @dataclass(frozen=True, kw_only=True)
